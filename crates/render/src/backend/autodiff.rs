@@ -1,0 +1,101 @@
+//! The hand-written backward pass, hooked into Burn's autodiff.
+
+use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved, host::shape_of};
+use burn::backend::{
+    Autodiff, AutodiffBackend,
+    autodiff::{
+        checkpoint::{base::Checkpointer, strategy::CheckpointStrategy},
+        grads::Gradients,
+        ops::{self, Backward as _, Ops, OpsKind},
+    },
+    tensor::FloatTensor,
+};
+
+/// What the backward pass of a frame needs.
+#[derive(Debug, Clone)]
+struct State<B: RenderOps> {
+    parameters: Parameters<B>,
+    saved: Saved<B>,
+    frame: Frame,
+    with_probe: bool,
+}
+
+#[derive(Debug)]
+struct RenderBackward;
+
+impl<B: RenderOps> ops::Backward<B, 6> for RenderBackward {
+    type State = State<B>;
+
+    fn backward(self, ops: Ops<Self::State, 6>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+        let v_image = grads.consume::<B>(&ops.node);
+        let State { parameters, saved, frame, with_probe } = ops.state;
+        let Backward { parameters: v, probe } = B::render_backward(parameters, saved, v_image, frame, with_probe);
+        let values = [v.means, v.quats, v.log_scales, v.opacity_logits, v.sh, probe.means2d];
+        for (parent, value) in ops.parents.into_iter().zip(values) {
+            if let Some(node) = parent {
+                grads.register::<B>(node.id, value);
+            }
+        }
+    }
+}
+
+/// The tensors of a tracked model without their graph.
+fn primitives<B: RenderOps, C: CheckpointStrategy>(p: Parameters<Autodiff<B, C>>) -> Parameters<B> {
+    Parameters {
+        means: p.means.into_primitive(),
+        quats: p.quats.into_primitive(),
+        log_scales: p.log_scales.into_primitive(),
+        opacity_logits: p.opacity_logits.into_primitive(),
+        sh: p.sh.into_primitive(),
+    }
+}
+
+/// Saved tensors as constants of the graph.
+fn constants<B: RenderOps, C: CheckpointStrategy>(s: Saved<B>) -> Saved<Autodiff<B, C>> {
+    Saved {
+        lanes: Autodiff::<B, C>::from_inner(s.lanes),
+        final_t: Autodiff::<B, C>::from_inner(s.final_t),
+        global_from_compact: s.global_from_compact,
+        tile_offsets: s.tile_offsets,
+        pair_splats: s.pair_splats,
+        record_offsets: s.record_offsets,
+        record_pairs: s.record_pairs,
+        tile_ends: s.tile_ends,
+        stop: s.stop,
+    }
+}
+
+impl<B: RenderOps, C: CheckpointStrategy> RenderOps for Autodiff<B, C> {
+    fn render_forward(parameters: Parameters<Self>, probe: Probe<Self>, frame: Frame) -> Forward<Self> {
+        let nodes = [
+            parameters.means.node(),
+            parameters.quats.node(),
+            parameters.log_scales.node(),
+            parameters.opacity_logits.node(),
+            parameters.sh.node(),
+            probe.means2d.node(),
+        ];
+        let prepared = RenderBackward.prepare::<C>(nodes).compute_bound().stateful();
+        let parameters = primitives::<B, C>(parameters);
+        let inner_probe = Probe { means2d: probe.means2d.into_primitive() };
+        let with_probe = shape_of::<B>(&inner_probe.means2d)[0] > 0;
+        match prepared {
+            OpsKind::Tracked(prepared) => {
+                let frame = Frame { keep: true, ..frame };
+                let out = B::render_forward(parameters.clone(), inner_probe, frame);
+                let saved = constants::<B, C>(out.saved.clone());
+                let state = State { parameters, saved: out.saved, frame, with_probe };
+                Forward { image: prepared.finish(state, out.image), saved, outcome: out.outcome }
+            }
+            OpsKind::UnTracked(prepared) => {
+                let out = B::render_forward(parameters, inner_probe, frame);
+                let saved = constants::<B, C>(out.saved);
+                Forward { image: prepared.finish(out.image), saved, outcome: out.outcome }
+            }
+        }
+    }
+
+    fn render_backward(_: Parameters<Self>, _: Saved<Self>, _: FloatTensor<Self>, _: Frame, _: bool) -> Backward<Self> {
+        panic!("the renderer has no second derivative: call `backward` once per frame")
+    }
+}

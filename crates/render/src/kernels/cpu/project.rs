@@ -1,0 +1,312 @@
+//! Projection: from N Gaussians to the V visible splats of one view.
+//!
+//! One chunk of [`CLUSTER`] rows per task; each reads its rows of the parameters and yields the lanes of its visible
+//! splats in row order. A Gaussian with a value that is not finite, or from which anything not finite is computed, is
+//! culled and counted. No Gaussians, or none visible, gives empty output.
+
+use super::cluster::{Cluster, Frustum};
+use crate::layout::{ALPHA_MIN, CLUSTER, DET_MIN, EXTENT_SLACK, QUAT_NORM2_MIN, lane};
+use crate::math::alpha::{LOG2_E, contour_power2, sigmoid};
+use crate::math::conic::{Dilated, conic, dilate};
+use crate::math::covariance::factor;
+use crate::math::ewa::{Linearization, ViewParams, linearize, project_factor, to_camera};
+use crate::math::quat::{Quat, UnitQuat, normalize, rotation};
+use crate::math::sh;
+use crate::math::vec::{Mat2x3, Mat3, Sym2, Vec3};
+use rayon::prelude::*;
+
+/// Parameters of N Gaussians as slices in C order; see [`gazesplat_core::GaussianCloud`] for their meaning.
+#[derive(Debug, Clone, Copy)]
+pub struct GaussianSlices<'a> {
+    /// `[N, 3]`.
+    pub means: &'a [f32],
+    /// `[N, 4]`, (w, x, y, z).
+    pub quats: &'a [f32],
+    /// `[N, 3]`.
+    pub log_scales: &'a [f32],
+    /// `[N]`.
+    pub opacity_logits: &'a [f32],
+    /// `[N, K, 3]`.
+    pub sh: &'a [f32],
+    /// K: coefficients stored per Gaussian and channel.
+    pub num_coefficients: usize,
+    /// Degree evaluated; (degree + 1)² ≤ K.
+    pub sh_degree: u32,
+}
+
+impl GaussianSlices<'_> {
+    /// Number of Gaussians N.
+    pub fn len(&self) -> usize {
+        self.opacity_logits.len()
+    }
+
+    /// True when there is no Gaussian.
+    pub fn is_empty(&self) -> bool {
+        self.opacity_logits.is_empty()
+    }
+
+    /// Mean of Gaussian `i`.
+    #[inline(always)]
+    pub(super) fn mean(&self, i: usize) -> Vec3 {
+        let [x, y, z] = self.means.as_chunks::<3>().0[i];
+        Vec3 { x, y, z }
+    }
+
+    /// Standard deviations of Gaussian `i`.
+    #[inline(always)]
+    pub(super) fn scales(&self, i: usize) -> Vec3 {
+        let [x, y, z] = self.log_scales.as_chunks::<3>().0[i];
+        Vec3 { x: x.exp(), y: y.exp(), z: z.exp() }
+    }
+
+    /// SH coefficients of Gaussian `i` up to the degree evaluated, `[(degree + 1)², 3]`.
+    #[inline(always)]
+    pub(super) fn coefficients(&self, i: usize) -> &[[f32; 3]] {
+        let rows = self.sh.as_chunks::<3>().0;
+        &rows[i * self.num_coefficients..][..gazesplat_core::sh::num_coefficients(self.sh_degree)]
+    }
+}
+
+/// The visible splats of one view, in the order of their Gaussians.
+#[derive(Debug, Clone, Default)]
+pub struct ProjectedSplats {
+    /// `[V, 12]`, lanes as in [`crate::layout::lane`].
+    pub lanes: Vec<f32>,
+    /// Index of the Gaussian behind each splat, ascending, `[V]`.
+    pub global_from_compact: Vec<u32>,
+    /// Gaussians culled for values that are not finite.
+    pub num_non_finite: u64,
+    /// Gaussians skipped with their cluster.
+    pub num_culled_by_cluster: u64,
+}
+
+impl ProjectedSplats {
+    /// Number of visible splats V.
+    pub fn len(&self) -> usize {
+        self.global_from_compact.len()
+    }
+
+    /// True when nothing is visible.
+    pub fn is_empty(&self) -> bool {
+        self.global_from_compact.is_empty()
+    }
+
+    /// Lanes of each splat.
+    pub fn rows(&self) -> &[[f32; lane::COUNT]] {
+        self.lanes.as_chunks().0
+    }
+}
+
+/// One view: camera, image size, near plane.
+#[derive(Debug, Clone, Copy)]
+pub struct ViewSpec {
+    /// Camera.
+    pub params: ViewParams,
+    /// Image width, pixels.
+    pub width: u32,
+    /// Image height, pixels.
+    pub height: u32,
+    /// Near plane, world units.
+    pub near: f32,
+}
+
+/// Shape of a Gaussian in the image, with what the gradient needs again.
+pub(super) struct Footprint {
+    pub unit: UnitQuat,
+    pub rotation: Mat3,
+    pub factor: Mat3,
+    pub linearization: Linearization,
+    pub projected_factor: Mat2x3,
+    pub dilated: Dilated,
+    pub conic: Sym2,
+}
+
+/// Steps 2 to 4 of the projection: Σ' and its inverse, for a Gaussian whose mean is `in_camera`.
+#[inline(always)]
+pub(super) fn footprint(view: &ViewParams, in_camera: Vec3, quat: [f32; 4], scales: Vec3) -> Footprint {
+    let [w, x, y, z] = quat;
+    let unit = normalize(Quat { w, x, y, z });
+    let rotation = rotation(unit.q);
+    let factor = factor(rotation, scales);
+    let linearization = linearize(*view, in_camera);
+    let projected_factor = project_factor(linearization.t, factor);
+    let dilated = dilate(projected_factor);
+    Footprint { unit, rotation, factor, linearization, projected_factor, dilated, conic: conic(dilated) }
+}
+
+/// What became of one Gaussian.
+enum Outcome {
+    Visible([f32; lane::COUNT]),
+    Culled,
+    NonFinite,
+}
+
+/// Projects all Gaussians; `clusters` are their bounds ([`super::cluster::clusters`]) if the caller keeps any.
+pub fn project(g: &GaussianSlices<'_>, view: &ViewSpec, clusters: Option<&[Cluster]>) -> ProjectedSplats {
+    let frustum = Frustum::new(&view.params, view.width as f32, view.height as f32, view.near);
+    let parts: Vec<ProjectedSplats> = (0..g.len().div_ceil(CLUSTER))
+        .into_par_iter()
+        .map(|chunk| {
+            let range = chunk * CLUSTER..((chunk + 1) * CLUSTER).min(g.len());
+            let mut part = ProjectedSplats::default();
+            if clusters.is_some_and(|c| frustum.excludes_cluster(&c[chunk])) {
+                part.num_culled_by_cluster = range.len() as u64;
+                return part;
+            }
+            for i in range {
+                match project_one(g, view, &frustum, i) {
+                    Outcome::Visible(lanes) => {
+                        part.lanes.extend_from_slice(&lanes);
+                        part.global_from_compact.push(i as u32);
+                    }
+                    Outcome::Culled => {}
+                    Outcome::NonFinite => part.num_non_finite += 1,
+                }
+            }
+            part
+        })
+        .collect();
+    concatenate(&parts)
+}
+
+/// The parts one after the other.
+fn concatenate(parts: &[ProjectedSplats]) -> ProjectedSplats {
+    let num_visible = parts.iter().map(ProjectedSplats::len).sum();
+    let mut all = ProjectedSplats {
+        lanes: Vec::with_capacity(num_visible * lane::COUNT),
+        global_from_compact: Vec::with_capacity(num_visible),
+        num_non_finite: parts.iter().map(|p| p.num_non_finite).sum(),
+        num_culled_by_cluster: parts.iter().map(|p| p.num_culled_by_cluster).sum(),
+    };
+    for part in parts {
+        all.lanes.extend_from_slice(&part.lanes);
+        all.global_from_compact.extend_from_slice(&part.global_from_compact);
+    }
+    all
+}
+
+/// Projection of Gaussian `i`.
+#[inline(always)]
+fn project_one(g: &GaussianSlices<'_>, view: &ViewSpec, frustum: &Frustum, i: usize) -> Outcome {
+    // 1. Mean in the camera; the comparison is false for NaN.
+    let mean = g.mean(i);
+    let in_camera = to_camera(view.params, mean);
+    if !(in_camera.z > view.near) {
+        let finite = mean.x.is_finite() && mean.y.is_finite() && mean.z.is_finite();
+        return if finite { Outcome::Culled } else { Outcome::NonFinite };
+    }
+    let quat = g.quats.as_chunks::<4>().0[i];
+    let log_scales = g.log_scales.as_chunks::<3>().0[i];
+    let logit = g.opacity_logits[i];
+    let rest = quat.iter().chain(&log_scales);
+    if ![mean.x, mean.y, mean.z, logit].iter().chain(rest).all(|v| v.is_finite()) {
+        return Outcome::NonFinite;
+    }
+    let opacity = sigmoid(logit);
+    if opacity < ALPHA_MIN || quat.iter().all(|q| q.abs() < 0.5 * QUAT_NORM2_MIN.sqrt()) {
+        return Outcome::Culled;
+    }
+    let scales = g.scales(i);
+    if frustum.excludes(mean, scales.x.max(scales.y).max(scales.z)) {
+        return Outcome::Culled;
+    }
+    // 2.–4. Σ' = J W Σ Wᵀ Jᵀ + 0.3 I and its inverse (Zwicker 2001; Kerbl 2023, Eq. 5).
+    let fp = footprint(&view.params, in_camera, quat, scales);
+    if fp.unit.norm * fp.unit.norm < QUAT_NORM2_MIN || fp.dilated.det <= DET_MIN {
+        return Outcome::Culled;
+    }
+    // 5. Extent of the contour α = 1/255.
+    let log2_opacity = opacity.ln() * LOG2_E;
+    let power2 = contour_power2(log2_opacity).max(0.0);
+    let extent_x = (power2 * fp.dilated.cov.xx).sqrt();
+    let extent_y = (power2 * fp.dilated.cov.yy).sqrt();
+    let mean_x = view.params.fx * in_camera.x / in_camera.z + view.params.cx;
+    let mean_y = view.params.fy * in_camera.y / in_camera.z + view.params.cy;
+    let (right, bottom) = (view.width as f32 - 0.5, view.height as f32 - 0.5);
+    let reach = 1.0 + EXTENT_SLACK;
+    if mean_x + extent_x * reach < 0.5
+        || mean_x - extent_x * reach > right
+        || mean_y + extent_y * reach < 0.5
+        || mean_y - extent_y * reach > bottom
+    {
+        return Outcome::Culled;
+    }
+    // 6. Colour seen from the camera centre.
+    let direction = view_direction(&view.params, mean);
+    let mut basis = [0.0; MAX_COEFFICIENTS];
+    sh_basis(g.sh_degree, direction.unit, &mut basis);
+    let mut color = [0.5f32; 3];
+    for (b, c) in basis.iter().zip(g.coefficients(i)) {
+        for a in 0..3 {
+            color[a] += b * c[a];
+        }
+    }
+    let lanes = [
+        mean_x,
+        mean_y,
+        fp.conic.xx,
+        fp.conic.xy,
+        fp.conic.yy,
+        log2_opacity,
+        color[0],
+        color[1],
+        color[2],
+        in_camera.z,
+        extent_x,
+        extent_y,
+    ];
+    if !lanes.iter().all(|v| v.is_finite()) {
+        return Outcome::NonFinite;
+    }
+    let mut lanes = lanes;
+    for c in &mut lanes[lane::RED..lane::RED + 3] {
+        *c = c.max(0.0);
+    }
+    Outcome::Visible(lanes)
+}
+
+/// SH coefficients of the highest degree.
+pub(super) const MAX_COEFFICIENTS: usize = gazesplat_core::sh::num_coefficients(gazesplat_core::sh::MAX_DEGREE);
+
+/// Direction from the camera centre to a mean.
+pub(super) struct ViewDirection {
+    /// Unit direction; (0, 0, 1) when the mean is the camera centre.
+    pub unit: Vec3,
+    /// 1 / distance.
+    pub inverse_distance: f32,
+}
+
+/// Direction in which the camera sees `mean`. The largest component is divided out first, so that far means do not
+/// overflow.
+#[inline(always)]
+pub(super) fn view_direction(view: &ViewParams, mean: Vec3) -> ViewDirection {
+    let (x, y, z) = (mean.x - view.position.x, mean.y - view.position.y, mean.z - view.position.z);
+    let largest = x.abs().max(y.abs()).max(z.abs()).max(f32::MIN_POSITIVE);
+    let (x, y, z) = (x / largest, y / largest, z / largest);
+    let inverse = 1.0 / (x * x + y * y + z * z).sqrt();
+    let inverse_distance = inverse / largest;
+    ViewDirection { unit: Vec3 { x: x * inverse, y: y * inverse, z: z * inverse }, inverse_distance }
+}
+
+/// Basis functions up to `degree` in the unit direction `d`.
+#[inline(always)]
+pub(super) fn sh_basis(degree: u32, d: Vec3, basis: &mut [f32; MAX_COEFFICIENTS]) {
+    let Vec3 { x, y, z } = d;
+    basis[0] = sh::C0;
+    if degree >= 1 {
+        let b = sh::band1(x, y, z);
+        basis[1..4].copy_from_slice(&[b.m0, b.m1, b.m2]);
+    }
+    if degree >= 2 {
+        let b = sh::band2(x, y, z);
+        basis[4..9].copy_from_slice(&[b.m0, b.m1, b.m2, b.m3, b.m4]);
+    }
+    if degree >= 3 {
+        let b = sh::band3(x, y, z);
+        basis[9..16].copy_from_slice(&[b.m0, b.m1, b.m2, b.m3, b.m4, b.m5, b.m6]);
+    }
+    if degree >= 4 {
+        let b = sh::band4(x, y, z);
+        basis[16..25].copy_from_slice(&[b.m0, b.m1, b.m2, b.m3, b.m4, b.m5, b.m6, b.m7, b.m8]);
+    }
+}

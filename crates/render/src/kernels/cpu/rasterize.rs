@@ -1,0 +1,345 @@
+//! Rasterisation: every pixel composites its tile's list front to back.
+//!
+//! One task per row of tiles; per tile, splats are staged in batches and each visits the rows its ellipse reaches,
+//! sixteen pixels at a time. The state of the 256 pixels stays in the first-level cache. A pixel that has stopped
+//! keeps its transmittance with the sign flipped: the test "T(1−α) > T_stop" then fails for every later splat without
+//! a mask. A tile ends when all its pixels have stopped. Empty lists give the background.
+
+use super::bin::TileLists;
+use super::stats::{PairStats, StatsLevel};
+use super::tile::{BATCH, CENTERS, RasterSplat, Row, RowI, Staged, TileRect, raster_splats, stage};
+use crate::layout::{TILE, lane};
+use crate::math::alpha::LOG2_ALPHA_MIN;
+use crate::simd::{Kernel, LANES, Simd, dispatch};
+use crate::stats::RenderStats;
+use rayon::prelude::*;
+
+/// Options of the rasterisers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RasterOptions {
+    /// Clamp of α.
+    pub alpha_max: f32,
+    /// A pixel stops before the splat that would bring T to this or below.
+    pub t_stop: f32,
+    /// Colour behind everything.
+    pub background: [f32; 3],
+    /// Fifth channel Σ T α z.
+    pub depth: bool,
+    /// Cut at α = 1/255 smoothed to C¹, for finite differences.
+    pub smooth_cutoff: bool,
+}
+
+impl RasterOptions {
+    /// Channels of the image.
+    pub fn num_channels(&self) -> usize {
+        if self.depth { 5 } else { 4 }
+    }
+}
+
+/// What a frame leaves behind.
+#[derive(Debug, Clone, Default)]
+pub struct Raster {
+    /// `[H, W, 4 or 5]`: RGB over the background, α = 1 − T, and Σ T α z if asked for. Empty for a statistics pass.
+    pub image: Vec<f32>,
+    /// Transmittance left at each pixel, `[H, W]`.
+    pub final_t: Vec<f32>,
+    /// List position at which each pixel stopped, `[H, W]`; `i32::MAX` = never.
+    pub stop: Vec<i32>,
+    /// List position at which each tile ended, `[tiles]`: entries before it were worked through.
+    pub tile_ends: Vec<u32>,
+    /// Counters of each pair, in list order, `[P]`; empty unless asked for.
+    pub pair_stats: Vec<PairStats>,
+    /// Per-tile counters, summed.
+    pub stats: RenderStats,
+}
+
+/// Pixels of one tile row.
+#[derive(Debug, Clone, Copy)]
+struct PixelRow {
+    /// Transmittance; negative once the pixel has stopped.
+    t: Row,
+    /// R, G, B, Σ T α z.
+    channels: [Row; 4],
+    /// List position of the stop.
+    stop: RowI,
+    /// Largest weight so far and its list position (statistics only).
+    best: Row,
+    best_index: RowI,
+}
+
+const FRESH: PixelRow = PixelRow {
+    t: Row([1.0; LANES]),
+    channels: [Row([0.0; LANES]); 4],
+    stop: RowI([i32::MAX; LANES]),
+    best: Row([0.0; LANES]),
+    best_index: RowI([-1; LANES]),
+};
+
+/// Composites all tiles. `splats`: lanes `[V]`; `keep` keeps what the backward pass needs.
+pub fn rasterize(
+    splats: &[[f32; lane::COUNT]],
+    lists: &TileLists,
+    options: &RasterOptions,
+    level: StatsLevel,
+    keep: bool,
+) -> Raster {
+    let (width, height) = (lists.grid.width as usize, lists.grid.height as usize);
+    let channels = if level == StatsLevel::None { options.num_channels() } else { 0 };
+    let mut raster = Raster {
+        image: vec![0.0; width * height * channels],
+        final_t: vec![0.0; if keep { width * height } else { 0 }],
+        stop: vec![0; if keep { width * height } else { 0 }],
+        tile_ends: vec![0; lists.grid.len()],
+        ..Raster::default()
+    };
+    let splats = &raster_splats(splats);
+    let mut tile_stats = vec![Vec::new(); lists.grid.tiles_y as usize];
+    // A missing plane is cut into empty strips, so that all planes zip.
+    let strip = |plane: usize| TILE * width * plane;
+    let strips = (0..lists.grid.tiles_y as usize)
+        .into_par_iter()
+        .zip(strips_of(&mut raster.image, strip(channels), lists))
+        .zip(strips_of(&mut raster.final_t, strip(usize::from(keep)), lists))
+        .zip(strips_of(&mut raster.stop, strip(usize::from(keep)), lists))
+        .zip(raster.tile_ends.par_chunks_mut(lists.grid.tiles_x as usize))
+        .zip(tile_stats.par_iter_mut())
+        .map(|(((((tile_y, image), final_t), stop), tile_ends), pair_stats)| {
+            let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats };
+            match (level, options.depth, options.smooth_cutoff) {
+                (StatsLevel::Dominance, ..) => dispatch(ForwardStrip::<false, 1, false>(strip)),
+                (StatsLevel::All, ..) => dispatch(ForwardStrip::<false, 2, false>(strip)),
+                (StatsLevel::None, false, false) => dispatch(ForwardStrip::<false, 0, false>(strip)),
+                (StatsLevel::None, true, false) => dispatch(ForwardStrip::<true, 0, false>(strip)),
+                (StatsLevel::None, false, true) => dispatch(ForwardStrip::<false, 0, true>(strip)),
+                (StatsLevel::None, true, true) => dispatch(ForwardStrip::<true, 0, true>(strip)),
+            }
+        })
+        .collect::<Vec<RenderStats>>();
+    for s in &strips {
+        raster.stats.add_tiles(s);
+    }
+    raster.pair_stats = tile_stats.into_iter().flatten().collect();
+    raster
+}
+
+/// `plane` cut into one strip per row of tiles; empty strips if there is no plane.
+pub(super) fn strips_of<'a, T: Send>(
+    plane: &'a mut [T],
+    strip: usize,
+    lists: &TileLists,
+) -> rayon::vec::IntoIter<&'a mut [T]> {
+    let len = plane.len();
+    let ends = (1..=lists.grid.tiles_y as usize).map(|row| (row * strip).min(len));
+    super::bin::split_at_offsets(plane, ends).into_par_iter()
+}
+
+/// One row of tiles and the parts of the output it owns.
+struct Strip<'a> {
+    splats: &'a [RasterSplat],
+    lists: &'a TileLists,
+    options: &'a RasterOptions,
+    tile_y: usize,
+    image: &'a mut [f32],
+    final_t: &'a mut [f32],
+    stop: &'a mut [i32],
+    tile_ends: &'a mut [u32],
+    pair_stats: &'a mut Vec<PairStats>,
+}
+
+/// The forward kernel. `STATS`: 0 = image, 1 = dominance counters, 2 = all counters; counters replace the image.
+struct ForwardStrip<'a, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(Strip<'a>);
+
+impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardStrip<'_, DEPTH, STATS, SMOOTH> {
+    type Output = RenderStats;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> RenderStats {
+        let Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats } = self.0;
+        let (width, height) = (lists.grid.width as usize, lists.grid.height as usize);
+        let mut stats = RenderStats::default();
+        let mut staged = [Staged::default(); BATCH];
+        for tile_x in 0..lists.grid.tiles_x as usize {
+            let tile = TileRect::new(tile_x, tile_y, width, height);
+            let id = tile_y * lists.grid.tiles_x as usize + tile_x;
+            let pairs = lists.tile_offsets[id] as usize..lists.tile_offsets[id + 1] as usize;
+            stats.num_tiles_empty += u64::from(pairs.is_empty());
+            let list = &lists.pair_splats[pairs];
+            let mut rows = [FRESH; TILE];
+            let outside = s.and_not(s.mask(u16::MAX), s.mask(tile.lane_bits()));
+            for row in &mut rows[..tile.height] {
+                s.store(s.select(outside, s.splat(-1.0), s.splat(1.0)), &mut row.t.0);
+            }
+            let first_pair = pair_stats.len();
+            if STATS > 0 {
+                pair_stats.resize(first_pair + list.len(), PairStats::default());
+            }
+            // Pixels that have not stopped; the tile ends at 0.
+            let mut alive = (tile.width * tile.height) as u32;
+            for (batch, indices) in list.chunks(BATCH).enumerate() {
+                stage(splats, indices, &tile, &mut staged);
+                for (k, splat) in staged[..indices.len()].iter().enumerate() {
+                    let index = batch * BATCH + k;
+                    let counters = pair_stats.get_mut(first_pair + index);
+                    let (stopped, num_rows) =
+                        composite::<S, DEPTH, STATS, SMOOTH>(s, splat, index as i32, &mut rows, options, counters);
+                    stats.num_lane_pixels += (num_rows * LANES) as u64;
+                    alive -= stopped;
+                    if alive == 0 {
+                        break;
+                    }
+                }
+                if alive == 0 {
+                    break;
+                }
+            }
+            // E: where the last pixel stopped; entries before it were worked through.
+            let end = if alive == 0 { last_stop(&rows, &tile) } else { list.len() };
+            stats.num_pairs_used += end as u64;
+            tile_ends[tile_x] = end as u32;
+            if STATS > 0 {
+                let counters = &mut pair_stats[first_pair..];
+                super::stats::credit_winners(
+                    counters,
+                    rows[..tile.height].iter().map(|r| (&r.best_index.0, tile.width)),
+                );
+                if STATS == 2 {
+                    stats.num_blended += counters.iter().map(|c| u64::from(c.pixels_blended)).sum::<u64>();
+                }
+            } else {
+                write_colors::<DEPTH>(&rows, &tile, width, options, image);
+            }
+            if !final_t.is_empty() {
+                for (y, row) in rows[..tile.height].iter().enumerate() {
+                    let at = y * width + tile.x0;
+                    for (dst, t) in final_t[at..at + tile.width].iter_mut().zip(&row.t.0) {
+                        *dst = t.abs();
+                    }
+                    stop[at..at + tile.width].copy_from_slice(&row.stop.0[..tile.width]);
+                }
+            }
+        }
+        stats
+    }
+}
+
+/// Blends one splat into the rows it reaches. Returns the pixels that stopped at it and the rows visited.
+#[inline(always)]
+fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
+    s: S,
+    g: &Staged,
+    index: i32,
+    rows: &mut [PixelRow; TILE],
+    options: &RasterOptions,
+    counters: Option<&mut PairStats>,
+) -> (u32, usize) {
+    let (first, end) = (g.first_row as usize, (g.end_row as usize).min(TILE));
+    if first >= end {
+        return (0, 0);
+    }
+    // log2 α = yy dy² + xy dx dy + (xx dx² + log2 o)
+    let dx = s.sub(s.load(&CENTERS), s.splat(g.mean_x));
+    let quadratic_x = s.fma(s.mul(s.splat(g.conic.xx), dx), dx, s.splat(g.log2_opacity));
+    let linear_x = s.mul(s.splat(g.conic.xy), dx);
+    let yy = s.splat(g.conic.yy);
+    let channels = g.channels.map(|c| s.splat(c));
+    let (cut, floor) = (s.splat(LOG2_ALPHA_MIN), s.splat(LOG2_ALPHA_MIN - 1.0));
+    let alpha_max = s.splat(options.alpha_max);
+    let t_stop = s.splat(options.t_stop);
+    let mut stopped = 0;
+    let (mut num_blended, mut weight_max, mut weight_sum) = (0, s.splat(0.0), s.splat(0.0));
+    for (row, center) in rows[first..end].iter_mut().zip(&CENTERS[first..end]) {
+        let dy = s.splat(center - g.mean_y);
+        let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
+        // Compared before the exponential; false for NaN.
+        let hit = s.ge(power, cut);
+        // Lanes far outside would be denormal, and every operation on those is a hundred times slower.
+        let mut alpha = s.exp2(s.max(power, floor));
+        if SMOOTH {
+            alpha = smooth_cutoff(s, alpha).0;
+        }
+        let alpha = s.min(alpha, alpha_max);
+        let t = s.load(&row.t.0);
+        let weight = s.mul(alpha, t);
+        let t_next = s.sub(t, weight);
+        // Kerbl 2023, App. C: stop before the splat that would end the pixel.
+        let blended = s.and(hit, s.gt(t_next, t_stop));
+        let ended = s.and_not(hit, blended);
+        let weight = s.keep(blended, weight);
+        let mut t_new = s.sub(t, weight);
+        if s.bits(ended) != 0 {
+            let now = s.and(ended, s.gt(t, s.splat(0.0)));
+            stopped += s.bits(now).count_ones();
+            t_new = s.select(ended, s.neg_abs(t), t_new);
+            s.store_i(s.select_i(now, s.splat_i(index), s.load_i(&row.stop.0)), &mut row.stop.0);
+        }
+        s.store(t_new, &mut row.t.0);
+        if STATS == 0 {
+            for c in 0..if DEPTH { 4 } else { 3 } {
+                let sum = s.fma(weight, channels[c], s.load(&row.channels[c].0));
+                s.store(sum, &mut row.channels[c].0);
+            }
+        } else {
+            let best = s.load(&row.best.0);
+            let better = s.and(blended, s.gt(weight, best));
+            s.store(s.select(better, weight, best), &mut row.best.0);
+            s.store_i(s.select_i(better, s.splat_i(index), s.load_i(&row.best_index.0)), &mut row.best_index.0);
+            weight_max = s.max(weight_max, weight);
+            if STATS == 2 {
+                num_blended += s.bits(blended).count_ones();
+                weight_sum = s.add(weight_sum, weight);
+            }
+        }
+    }
+    if STATS > 0
+        && let Some(counters) = counters
+    {
+        counters.weight_max = s.reduce_max(weight_max);
+        if STATS == 2 {
+            let zero = s.splat(0.0);
+            counters.set_blended(num_blended, s.reduce_sum4(weight_sum, zero, zero, zero)[0]);
+        }
+    }
+    (stopped, end - first)
+}
+
+/// The test-only smooth cut: α·h(u) and its derivative with respect to α, u = clamp(255 α − 1, 0, 1), h(u) = u²(3 − 2u).
+#[inline(always)]
+pub(super) fn smooth_cutoff<S: Simd>(s: S, alpha: S::F) -> (S::F, S::F) {
+    let u = s.fma(alpha, s.splat(255.0), s.splat(-1.0));
+    let u = s.min(s.max(u, s.splat(0.0)), s.splat(1.0));
+    let h = s.mul(s.mul(u, u), s.fnma(s.splat(2.0), u, s.splat(3.0)));
+    let slope = s.mul(s.mul(s.splat(6.0), u), s.sub(s.splat(1.0), u));
+    (s.mul(alpha, h), s.fma(s.mul(alpha, s.splat(255.0)), slope, h))
+}
+
+/// The largest stop position of the pixels inside the image.
+#[inline(always)]
+fn last_stop(rows: &[PixelRow; TILE], tile: &TileRect) -> usize {
+    let last = rows[..tile.height].iter().flat_map(|r| &r.stop.0[..tile.width]).copied().max();
+    usize::try_from(last.unwrap_or(0)).unwrap_or(0)
+}
+
+/// Writes a tile's pixels: colour over the background, 1 − T, and depth.
+#[inline(always)]
+fn write_colors<const DEPTH: bool>(
+    rows: &[PixelRow; TILE],
+    tile: &TileRect,
+    width: usize,
+    options: &RasterOptions,
+    image: &mut [f32],
+) {
+    let num = if DEPTH { 5 } else { 4 };
+    for (y, row) in rows[..tile.height].iter().enumerate() {
+        let pixels = &mut image[(y * width + tile.x0) * num..][..tile.width * num];
+        for (x, pixel) in pixels.chunks_exact_mut(num).enumerate() {
+            let t = row.t.0[x].abs();
+            for c in 0..3 {
+                pixel[c] = row.channels[c].0[x] + t * options.background[c];
+            }
+            pixel[3] = 1.0 - t;
+            if DEPTH {
+                pixel[4] = row.channels[3].0[x];
+            }
+        }
+    }
+}

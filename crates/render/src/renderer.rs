@@ -1,0 +1,120 @@
+//! Drawing frames: the public operations of this crate.
+
+use crate::backend::{Frame, Parameters, Probe, RenderOps};
+use crate::error::{Error, Result};
+use crate::kernels::cpu::project::ViewSpec;
+use crate::kernels::cpu::rasterize::RasterOptions;
+use crate::layout::T_FLOOR;
+use crate::options::{Pass, RenderOptions, Termination};
+use crate::splats::Splats;
+use crate::stats::{RenderStats, SplatStats};
+use crate::view_params::view_params;
+use burn::backend::Dispatch;
+use burn::tensor::{Device, Tensor};
+use gazesplat_core::Camera;
+
+/// A drawn frame.
+#[derive(Debug, Clone)]
+pub struct Rendered {
+    /// `[H, W, 4]`: RGB composited over the background, and alpha = 1 − T; `[H, W, 5]` with depth, Σ T α z.
+    pub image: Tensor<3>,
+    /// What was done and what was skipped.
+    pub stats: RenderStats,
+    /// Counters per Gaussian, if asked for.
+    pub splat_stats: SplatStats,
+}
+
+/// A leaf that receives the image-plane gradient of the means: what densification decides by.
+#[derive(Debug, Clone)]
+pub struct MeansProbe(Tensor<2>);
+
+impl MeansProbe {
+    /// A probe for `num_splats` Gaussians on the autodiff device of the splats.
+    pub fn new(num_splats: usize, device: &Device) -> Self {
+        Self(Tensor::zeros([num_splats, 4], device).require_grad())
+    }
+
+    /// After `backward`: `[N, 4]` = (∂L/∂x, ∂L/∂y, Σ|∂L/∂x|, Σ|∂L/∂y|) of the projected means in pixels, the last two
+    /// summed per pixel (Ye 2024). `None` if no gradient arrived.
+    pub fn gradient(&self, gradients: &burn::tensor::Gradients) -> Option<Tensor<2>> {
+        self.0.grad(gradients)
+    }
+}
+
+/// Draws `splats` as `camera` sees them. Differentiable with respect to everything in `splats` that is tracked.
+///
+/// # Errors
+/// [`Error::Parameter`] for options or a camera out of range, [`Error::Shape`] if the tensors do not fit together,
+/// [`Error::Limit`] if the frame needs more pairs than there are indices.
+pub fn render(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Rendered> {
+    let probe = Tensor::zeros([0, 4], &splats.device());
+    render_with(splats, probe, camera, options)
+}
+
+/// [`render`], with the image-plane gradient of the means delivered to `probe`.
+///
+/// # Errors
+/// As [`render`].
+pub fn render_probed(
+    splats: &Splats,
+    probe: &MeansProbe,
+    camera: &Camera,
+    options: &RenderOptions,
+) -> Result<Rendered> {
+    render_with(splats, probe.0.clone(), camera, options)
+}
+
+fn render_with(splats: &Splats, probe: Tensor<2>, camera: &Camera, options: &RenderOptions) -> Result<Rendered> {
+    let frame = frame(splats, camera, options)?;
+    let parameters = Parameters {
+        means: splats.means.clone().into_dispatch(),
+        quats: splats.quats.clone().into_dispatch(),
+        log_scales: splats.log_scales.clone().into_dispatch(),
+        opacity_logits: splats.opacity_logits.clone().into_dispatch(),
+        sh: splats.sh.clone().into_dispatch(),
+    };
+    let out = <Dispatch as RenderOps>::render_forward(parameters, Probe { means2d: probe.into_dispatch() }, frame);
+    let (stats, splat_stats) = out.outcome?;
+    Ok(Rendered { image: Tensor::from_dispatch(out.image), stats, splat_stats })
+}
+
+/// Checks everything that can be wrong before any work, and puts it into the form the kernels read.
+fn frame(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Frame> {
+    options.validate()?;
+    check_shapes(splats)?;
+    let stored = splats.sh_degree();
+    let sh_degree = options.sh_degree.unwrap_or(stored).min(stored);
+    let Termination::Fixed(t_stop) = options.termination;
+    Ok(Frame {
+        view: ViewSpec {
+            params: view_params(camera)?,
+            width: camera.intrinsics.width,
+            height: camera.intrinsics.height,
+            near: options.near,
+        },
+        raster: RasterOptions {
+            alpha_max: options.alpha_max,
+            t_stop: t_stop.max(T_FLOOR),
+            background: options.background,
+            depth: options.depth,
+            smooth_cutoff: options.pass == Pass::SmoothCutoff,
+        },
+        sh_degree,
+        stats: options.stats,
+        keep: options.pass != Pass::Inference,
+    })
+}
+
+fn check_shapes(splats: &Splats) -> Result<()> {
+    let n = splats.len();
+    let check = |name, found: &[usize], expected: &[usize]| match found == expected {
+        true => Ok(()),
+        false => Err(Error::Shape { name, found: found.to_vec(), expected: expected.to_vec() }),
+    };
+    check("means", &splats.means.dims(), &[n, 3])?;
+    check("quats", &splats.quats.dims(), &[n, 4])?;
+    check("log_scales", &splats.log_scales.dims(), &[n, 3])?;
+    check("opacity_logits", &splats.opacity_logits.dims(), &[n])?;
+    let k = splats.num_coefficients();
+    check("sh", &splats.sh.dims(), &[n, k.max(1), 3])
+}

@@ -1,0 +1,61 @@
+//! Counters: what a frame did and what it skipped, and what each Gaussian earned and cost in it.
+
+use serde::Serialize;
+
+/// What one frame did and what it could skip.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+pub struct RenderStats {
+    /// Gaussians in the model.
+    pub num_splats: u64,
+    /// Gaussians culled because a parameter, or what was computed from it, is not finite.
+    pub num_culled_non_finite: u64,
+    /// Gaussians that were skipped with their whole cluster, without being read.
+    pub num_culled_by_cluster: u64,
+    /// Gaussians that reach at least one pixel centre's tile.
+    pub num_visible: u64,
+    /// (Gaussian, tile) pairs a test of bounding boxes would give.
+    pub num_pairs_box: u64,
+    /// (Gaussian, tile) pairs of the exact test.
+    pub num_pairs: u64,
+    /// Pairs worked through before their tile had stopped.
+    pub num_pairs_used: u64,
+    /// Lane-pixels computed: 16 for every tile row a pair visits.
+    pub num_lane_pixels: u64,
+    /// Pixels blended, over all pairs; filled by [`crate::StatsMode::All`] only.
+    pub num_blended: u64,
+    /// Tiles of the image.
+    pub num_tiles: u64,
+    /// Tiles without any pair.
+    pub num_tiles_empty: u64,
+}
+
+impl RenderStats {
+    /// Adds the per-tile counters of `other`, the result of another part of the image.
+    pub(crate) fn add_tiles(&mut self, other: &Self) {
+        self.num_pairs_used += other.num_pairs_used;
+        self.num_lane_pixels += other.num_lane_pixels;
+        self.num_blended += other.num_blended;
+        self.num_tiles_empty += other.num_tiles_empty;
+    }
+}
+
+/// Work and worth of each Gaussian in one view, `[N]` each; empty where the [`crate::StatsMode`] does not fill it.
+///
+/// A tile's list is walked front to back until its last pixel has stopped, at position E; a pixel blends an entry iff
+/// α ≥ 1/255 and T(1−α) is above the stopping transmittance. All counters are integers or maxima, so they do not depend
+/// on the order in which tiles are worked.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct SplatStats {
+    /// Tiles in which the Gaussian stands at a list position below E (RTGS: Comp).
+    pub tiles_used: Vec<u32>,
+    /// Pixels in which it has the largest weight T·α of all blended entries; the nearer wins a tie (RTGS: Val).
+    pub pixels_dominated: Vec<u32>,
+    /// Pixels in which it is blended.
+    pub pixels_blended: Vec<u32>,
+    /// Largest weight T·α over the pixels of the view.
+    pub weight_max: Vec<f32>,
+    /// Sum of the weights over the pixels, fixed point in units of 2⁻³².
+    pub weight_sum: Vec<u64>,
+    /// Tiles in which it is blended in at least one pixel.
+    pub tiles_blended: Vec<u32>,
+}

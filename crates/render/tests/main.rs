@@ -1,0 +1,12 @@
+//! Tests of the renderer, in one binary: every file links Burn only once that way. `simd_agreement` stands apart because it
+//! switches the instruction set of the whole process.
+
+mod common;
+mod counters;
+mod determinism;
+mod finite_diff;
+mod golden;
+mod golden_work_stats;
+mod random_values;
+mod stability;
+mod stability_limits;

@@ -1,0 +1,344 @@
+//! Settings of a training run: plain data with defaults in place, unknown keys rejected.
+//!
+//! Keys with a step count say how they behave in runs shorter than the 30,000 steps the published defaults are made for.
+
+use crate::error::{Error, Result};
+use gazesplat_render::RenderOptions;
+use serde::{Deserialize, Serialize};
+
+/// All settings of a training run.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// Length, seed and reporting of the run.
+    pub train: TrainSection,
+    /// Which images, at which size.
+    pub data: DataSection,
+    /// Shape of the model.
+    pub model: ModelSection,
+    /// The first Gaussians.
+    pub init: InitSection,
+    /// Learning rates.
+    pub optim: OptimSection,
+    /// How the number of Gaussians changes.
+    pub densify: DensifySection,
+    /// Terms of the loss.
+    pub loss: LossSection,
+    /// The renderer.
+    pub render: RenderSection,
+}
+
+/// Length, seed and reporting of the run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainSection {
+    /// Optimiser steps, one view each; at least 1. Default 30000.
+    pub steps: u32,
+    /// Seed of every random number of the run. Default 0.
+    pub seed: u64,
+    /// Worker threads; 0 = one per core. The result does not depend on it. Default 0.
+    pub threads: usize,
+    /// A step is reported to logs every this many steps, and after the last; at least 1. Default 10.
+    pub log_every: u32,
+    /// The test views are measured every this many steps, and after the last; 0 = only after the last. Default 5000.
+    pub eval_every: u32,
+}
+
+impl Default for TrainSection {
+    fn default() -> Self {
+        Self { steps: 30_000, seed: 0, threads: 0, log_every: 10, eval_every: 5000 }
+    }
+}
+
+/// Which images, at which size.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DataSection {
+    /// Longest image side in pixels; larger images are downscaled with an area filter. 0 = as they are. Default 1600.
+    pub max_side: u32,
+    /// Image directory beside `sparse`, as in `images_4`; unset = `images`.
+    pub images: Option<String>,
+    /// Every n-th view in name order, from the first, is a test view; 0 = all views train. Default 8 (3DGS).
+    pub test_every: u32,
+    /// Bytes of decoded images kept in memory. Default 4 GiB.
+    pub cache_bytes: usize,
+    /// What shows through transparent pixels of images and where no Gaussian is:
+    /// `"black"`, `"white"`, `"random"` (a new colour each step) or `[r, g, b]` in 0..1. Default `"black"`.
+    pub background: Background,
+}
+
+impl Default for DataSection {
+    fn default() -> Self {
+        Self { max_side: 1600, images: None, test_every: 8, cache_bytes: 4 << 30, background: Background::default() }
+    }
+}
+
+/// A named background or an RGB triple in 0..1.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Background {
+    /// One of the names.
+    Named(NamedBackground),
+    /// RGB in 0..1, sRGB-encoded.
+    Rgb([f32; 3]),
+}
+
+/// Backgrounds with a name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum NamedBackground {
+    /// (0, 0, 0).
+    Black,
+    /// (1, 1, 1).
+    White,
+    /// A new uniformly random colour each training step; black in evaluation. Keeps transparent scenes from painting
+    /// the background with Gaussians.
+    Random,
+}
+
+impl Default for Background {
+    fn default() -> Self {
+        Self::Named(NamedBackground::Black)
+    }
+}
+
+impl Background {
+    /// The colour used in evaluation and, unless random, in training.
+    pub fn fixed_rgb(&self) -> [f32; 3] {
+        match self {
+            Self::Named(NamedBackground::White) => [1.0; 3],
+            Self::Named(NamedBackground::Black | NamedBackground::Random) => [0.0; 3],
+            Self::Rgb(rgb) => *rgb,
+        }
+    }
+}
+
+/// Shape of the model.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ModelSection {
+    /// Degree of the spherical harmonics, 0 to 3. Default 3.
+    pub sh_degree: u32,
+}
+
+impl Default for ModelSection {
+    fn default() -> Self {
+        Self { sh_degree: 3 }
+    }
+}
+
+/// The first Gaussians.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct InitSection {
+    /// Initial opacity, in (0, 1). Default 0.1 (3DGS).
+    pub opacity: f32,
+    /// Initial scale as a multiple of the root mean square distance to the three nearest neighbours. Default 1 (3DGS).
+    pub scale: f32,
+    /// Number of random Gaussians when the scene has no points; never more than `densify.cap`. Default 50000.
+    pub random_points: usize,
+}
+
+impl Default for InitSection {
+    fn default() -> Self {
+        Self { opacity: 0.1, scale: 1.0, random_points: 50_000 }
+    }
+}
+
+/// Learning rates of Adam (β 0.9 and 0.999, ε 1e-15), per group; 3DGS, Sec. 7.1 and its code.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct OptimSection {
+    /// Rate of the means at the first step, in units of the scene extent. Default 1.6e-4.
+    pub means_lr: f32,
+    /// Rate of the means at the last step, reached log-linearly. Default 1.6e-6.
+    pub means_lr_end: f32,
+    /// Rate of the log scales. Default 5e-3.
+    pub log_scales_lr: f32,
+    /// Rate of the quaternions. Default 1e-3.
+    pub quats_lr: f32,
+    /// Rate of the opacity logits. Default 5e-2.
+    pub opacity_lr: f32,
+    /// Rate of the constant SH coefficient. Default 2.5e-3.
+    pub sh_dc_lr: f32,
+    /// The other SH coefficients learn this many times slower. Default 20.
+    pub sh_rest_divisor: f32,
+    /// Steps between two rises of the SH degree, for a run of 30,000 steps; scaled with `train.steps`. Default 1000.
+    pub sh_degree_every: u32,
+}
+
+impl Default for OptimSection {
+    fn default() -> Self {
+        Self {
+            means_lr: 1.6e-4,
+            means_lr_end: 1.6e-6,
+            log_scales_lr: 5e-3,
+            quats_lr: 1e-3,
+            opacity_lr: 5e-2,
+            sh_dc_lr: 2.5e-3,
+            sh_rest_divisor: 20.0,
+            sh_degree_every: 1000,
+        }
+    }
+}
+
+/// How the number of Gaussians changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StrategyKind {
+    /// Relocation, growth and position noise of Kheradmand 2024.
+    Mcmc,
+    /// The initial Gaussians are only optimised.
+    None,
+}
+
+/// How the number of Gaussians changes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DensifySection {
+    /// `"mcmc"` or `"none"`. Default `"mcmc"`.
+    pub strategy: StrategyKind,
+    /// Largest number of Gaussians. Default 300000.
+    pub cap: usize,
+    /// First step at which Gaussians are relocated and added; at most 1/20 of the run. Default 500.
+    pub start: u32,
+    /// Share of the run after which the number stays as it is, in (0, 1]. Default 5/6.
+    pub stop: f32,
+    /// Steps between two refinements; at most 1/100 of the run, at least 5. Default 100.
+    pub every: u32,
+    /// Growth per refinement. Where this would not reach `cap` by the middle of the run, as in short runs, it is raised
+    /// to what does. Default 0.05.
+    pub growth: f32,
+    /// A Gaussian of at most this opacity is dead and moved to a live one. Default 0.005.
+    pub min_opacity: f32,
+    /// Position noise as a multiple of the rate of the means (MCMC, Eq. 8). Default 5e5.
+    pub noise: f32,
+    /// Weight of the mean opacity in the loss (MCMC, Eq. 10). Default 0.01.
+    pub opacity_regularizer: f32,
+    /// Weight of the mean scale in the loss (MCMC, Eq. 10). Default 0.01.
+    pub scale_regularizer: f32,
+}
+
+impl Default for DensifySection {
+    fn default() -> Self {
+        Self {
+            strategy: StrategyKind::Mcmc,
+            cap: 300_000,
+            start: 500,
+            stop: 5.0 / 6.0,
+            every: 100,
+            growth: 0.05,
+            min_opacity: 0.005,
+            noise: 5e5,
+            opacity_regularizer: 0.01,
+            scale_regularizer: 0.01,
+        }
+    }
+}
+
+/// Terms of the loss.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LossSection {
+    /// λ of (1 − λ) L1 + λ (1 − SSIM), in 0..1. Default 0.2 (3DGS, Eq. 7).
+    pub ssim_weight: f32,
+}
+
+impl Default for LossSection {
+    fn default() -> Self {
+        Self { ssim_weight: 0.2 }
+    }
+}
+
+/// The renderer.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RenderSection {
+    /// Gaussians nearer than this, in world units along the viewing axis, are not drawn. Default 0.01.
+    pub near: f32,
+    /// Largest opacity of one Gaussian at one pixel. Default 0.999.
+    pub alpha_max: f32,
+}
+
+impl Default for RenderSection {
+    fn default() -> Self {
+        let options = RenderOptions::default();
+        Self { near: options.near, alpha_max: options.alpha_max }
+    }
+}
+
+impl Config {
+    /// Options of the renderer in evaluation: all SH bands, fixed background.
+    pub fn render_options(&self) -> RenderOptions {
+        RenderOptions {
+            near: self.render.near,
+            alpha_max: self.render.alpha_max,
+            background: self.data.background.fixed_rgb(),
+            ..RenderOptions::default()
+        }
+    }
+
+    /// Checks every range.
+    ///
+    /// # Errors
+    /// [`Error::Parameter`] naming the first key that is out of its range.
+    pub fn validate(&self) -> Result<()> {
+        let check = |ok: bool, key: &str, found: &dyn std::fmt::Display, expected: &str| {
+            if ok { Ok(()) } else { Err(Error::parameter(key, format!("found {found}, expected {expected}"))) }
+        };
+        let positive =
+            |key: &str, value: f32| check(value > 0.0 && value.is_finite(), key, &value, "a positive number");
+        let non_negative =
+            |key: &str, value: f32| check(value >= 0.0 && value.is_finite(), key, &value, "a number of at least 0");
+        let open_unit = |key: &str, value: f32| check(value > 0.0 && value < 1.0, key, &value, "a number in (0, 1)");
+        check(self.train.steps >= 1, "train.steps", &self.train.steps, "at least 1")?;
+        check(self.train.log_every >= 1, "train.log_every", &self.train.log_every, "at least 1")?;
+        if let Background::Rgb(rgb) = self.data.background {
+            for value in rgb {
+                check((0.0..=1.0).contains(&value), "data.background", &value, "three numbers in 0..1")?;
+            }
+        }
+        check(self.model.sh_degree <= 3, "model.sh_degree", &self.model.sh_degree, "0, 1, 2 or 3")?;
+        open_unit("init.opacity", self.init.opacity)?;
+        positive("init.scale", self.init.scale)?;
+        check(self.init.random_points >= 1, "init.random_points", &self.init.random_points, "at least 1")?;
+        positive("optim.means_lr", self.optim.means_lr)?;
+        positive("optim.means_lr_end", self.optim.means_lr_end)?;
+        non_negative("optim.log_scales_lr", self.optim.log_scales_lr)?;
+        non_negative("optim.quats_lr", self.optim.quats_lr)?;
+        non_negative("optim.opacity_lr", self.optim.opacity_lr)?;
+        non_negative("optim.sh_dc_lr", self.optim.sh_dc_lr)?;
+        positive("optim.sh_rest_divisor", self.optim.sh_rest_divisor)?;
+        check(self.densify.cap >= 1, "densify.cap", &self.densify.cap, "at least 1")?;
+        check(self.densify.every >= 1, "densify.every", &self.densify.every, "at least 1")?;
+        let stop = self.densify.stop;
+        check(stop > 0.0 && stop <= 1.0, "densify.stop", &stop, "a number in (0, 1]")?;
+        non_negative("densify.growth", self.densify.growth)?;
+        open_unit("densify.min_opacity", self.densify.min_opacity)?;
+        non_negative("densify.noise", self.densify.noise)?;
+        non_negative("densify.opacity_regularizer", self.densify.opacity_regularizer)?;
+        non_negative("densify.scale_regularizer", self.densify.scale_regularizer)?;
+        let ssim_weight = self.loss.ssim_weight;
+        check((0.0..=1.0).contains(&ssim_weight), "loss.ssim_weight", &ssim_weight, "a number in 0..1")?;
+        positive("render.near", self.render.near)?;
+        open_unit("render.alpha_max", self.render.alpha_max)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn defaults_are_valid() {
+        Config::default().validate().expect("the test sets this up");
+    }
+
+    #[test]
+    fn values_out_of_range_are_named() {
+        let mut config = Config::default();
+        config.densify.stop = f32::NAN;
+        let message = config.validate().expect_err("the test expects a refusal").to_string();
+        assert!(message.starts_with("densify.stop") && message.contains("NaN"), "{message}");
+    }
+}

@@ -1,0 +1,68 @@
+//! Quality of a model on views it has not been trained on.
+
+use crate::error::Result;
+use crate::losses::LossTarget;
+use crate::metrics;
+use gazesplat_core::image::ImageF32;
+use gazesplat_core::io::images::ImageCache;
+use gazesplat_render::{RenderOptions, Rendered, Splats, render};
+use serde::{Deserialize, Serialize};
+
+/// Quality of one view.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ViewScore {
+    /// Name of the view.
+    pub name: String,
+    /// Peak signal-to-noise ratio in dB, at most [`metrics::MAX_PSNR_DB`].
+    pub psnr: f64,
+    /// Mean SSIM.
+    pub ssim: f64,
+}
+
+/// Quality of a model: what `eval.json` holds.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EvalReport {
+    /// Mean of the views' PSNR, dB; 0 without views.
+    pub psnr: f64,
+    /// Mean of the views' SSIM; 0 without views.
+    pub ssim: f64,
+    /// Gaussians of the model.
+    pub num_gaussians: usize,
+    /// Every view, in the order of the cache.
+    pub views: Vec<ViewScore>,
+}
+
+/// Renders every view of `images` and compares it with its photograph (composited over the background of `options`);
+/// `each` gets the score and the render, `[H, W, 3]` unclamped, of every view in order.
+///
+/// # Errors
+/// When a photograph cannot be read, or the renderer refuses.
+pub fn evaluate(
+    splats: &Splats,
+    images: &ImageCache,
+    options: &RenderOptions,
+    each: &mut dyn FnMut(&ViewScore, &ImageF32),
+) -> Result<EvalReport> {
+    let mut views = Vec::with_capacity(images.len());
+    for (index, view) in images.views().iter().enumerate() {
+        let target = LossTarget::new(images.get(index)?, options.background);
+        let image = rgb(render(splats, &view.camera, options)?);
+        let score = ViewScore {
+            name: view.name.clone(),
+            psnr: metrics::psnr(&image, &target),
+            ssim: metrics::ssim(&image, &target),
+        };
+        each(&score, &image);
+        views.push(score);
+    }
+    let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len().max(1) as f64;
+    Ok(EvalReport { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), num_gaussians: splats.len(), views })
+}
+
+/// The colours of a frame, `[H, W, 3]`.
+pub fn rgb(rendered: Rendered) -> ImageF32 {
+    let [height, width, channels] = rendered.image.dims();
+    let values = crate::optim::into_vec(rendered.image);
+    let data = values.chunks_exact(channels).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
+    ImageF32 { width: width as u32, height: height as u32, data }
+}

@@ -1,0 +1,26 @@
+//! Training of 3D Gaussian models: losses, optimiser, densification, the loop, evaluation.
+//!
+//! A [`Trainer`] owns a model and advances it one view at a time; it prints nothing. [`run`] drives it to the end of its
+//! budget, evaluates on the way and tells [`Observer`]s what happens. Sources, as cited in the code: `3DGS` = Kerbl 2023,
+//! `MCMC` = Kheradmand 2024, Wang 2004 (SSIM), Kingma 2015 (Adam).
+
+pub mod config;
+pub mod densify;
+pub mod error;
+pub mod evaluate;
+pub mod event;
+pub mod init;
+pub mod losses;
+pub mod metrics;
+pub mod optim;
+pub mod rng;
+pub mod run;
+mod simd;
+pub mod trainer;
+
+pub use config::Config;
+pub use error::{Error, Result};
+pub use evaluate::{EvalReport, ViewScore, evaluate};
+pub use event::{DensifyReport, Observer, StageMs, StepReport, TrainEvent};
+pub use run::{Outcome, run, with_threads};
+pub use trainer::Trainer;

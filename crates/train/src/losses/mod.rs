@@ -1,0 +1,113 @@
+//! Losses between a rendered image and a photograph: terms of a weighted sum, each with its report.
+
+pub mod l1_ssim;
+pub mod ssim_kernel;
+
+pub use l1_ssim::L1Ssim;
+
+use burn::tensor::Tensor;
+use gazesplat_core::image::RgbImage8;
+use gazesplat_core::io::images::TrainingImage;
+use std::sync::Arc;
+
+/// What an image is compared with: 8-bit colours, shared with the image cache, and the mask.
+#[derive(Debug, Clone)]
+pub struct LossTarget {
+    photo: Arc<TrainingImage>,
+    composited: Option<Arc<RgbImage8>>,
+}
+
+impl LossTarget {
+    /// The photograph, over `background` (RGB in 0..1) where it is transparent.
+    pub fn new(photo: Arc<TrainingImage>, background: [f32; 3]) -> Self {
+        let composited = photo.alpha.is_some().then(|| Arc::new(photo.composited(background)));
+        Self { photo, composited }
+    }
+
+    /// Width and height in pixels.
+    pub fn size(&self) -> (usize, usize) {
+        (self.photo.image.width as usize, self.photo.image.height as usize)
+    }
+
+    /// Colours `[height, width, 3]`.
+    pub fn rgb(&self) -> &[u8] {
+        self.composited.as_ref().map_or(&self.photo.image.data, |c| &c.data)
+    }
+
+    /// `[height, width]`, 0 = the pixel carries no loss.
+    pub fn mask(&self) -> Option<&[u8]> {
+        self.photo.mask.as_deref()
+    }
+}
+
+/// One term of a loss.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossTerm {
+    /// Name, as in logs.
+    pub name: &'static str,
+    /// Value before weighting.
+    pub value: f32,
+}
+
+/// A loss and what it is made of.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct LossTerms {
+    /// The weighted sum that is minimised.
+    pub total: f32,
+    /// The terms, unweighted, in a fixed order.
+    pub terms: Vec<LossTerm>,
+}
+
+impl LossTerms {
+    /// The value of a term.
+    pub fn get(&self, name: &str) -> Option<f32> {
+        self.terms.iter().find(|t| t.name == name).map(|t| t.value)
+    }
+}
+
+/// A differentiable value of an image and its report.
+#[derive(Debug)]
+pub struct ImageLossValue {
+    /// `[1]`, on the graph of the image.
+    pub loss: Tensor<1>,
+    /// The terms it is made of, unweighted.
+    pub terms: Vec<LossTerm>,
+}
+
+/// A loss between a rendered image and a photograph.
+pub trait ImageLoss: Send {
+    /// The value for `image`, `[H, W, 4 or 5]`: RGB over the background, alpha, depth if there is a fifth channel.
+    fn evaluate(&self, image: Tensor<3>, target: &LossTarget) -> ImageLossValue;
+}
+
+/// A weighted sum of image losses.
+#[derive(Default)]
+pub struct WeightedLosses {
+    losses: Vec<(f32, Box<dyn ImageLoss>)>,
+}
+
+impl WeightedLosses {
+    /// Adds `weight` times `loss`.
+    pub fn with(mut self, weight: f32, loss: Box<dyn ImageLoss>) -> Self {
+        self.losses.push((weight, loss));
+        self
+    }
+
+    /// The sum, `[1]` on the graph of the image, and its terms; `None` when there is no loss to sum.
+    pub fn evaluate(&self, image: Tensor<3>, target: &LossTarget) -> Option<(Tensor<1>, LossTerms)> {
+        let mut sum: Option<Tensor<1>> = None;
+        let mut report = LossTerms::default();
+        for (weight, loss) in &self.losses {
+            let value = loss.evaluate(image.clone(), target);
+            report.terms.extend(value.terms);
+            let weighted = if *weight == 1.0 { value.loss } else { value.loss.mul_scalar(*weight) };
+            sum = Some(match sum {
+                Some(sum) => sum + weighted,
+                None => weighted,
+            });
+        }
+        let sum = sum?;
+        report.total = crate::optim::into_vec(sum.clone().inner())[0];
+        Some((sum, report))
+    }
+}

@@ -1,0 +1,95 @@
+//! Image quality: PSNR and SSIM of a float image against an 8-bit photograph.
+
+use crate::losses::LossTarget;
+use crate::losses::ssim_kernel::{Comparison, similarity};
+use gazesplat_core::image::ImageF32;
+use rayon::prelude::*;
+
+/// Value reported for identical images, and the largest one: a mean over views has to stay finite.
+pub const MAX_PSNR_DB: f64 = 100.0;
+
+/// Peak signal-to-noise ratio in dB, −10 log₁₀ MSE over unmasked pixels and the three channels, of `image` clamped to
+/// [0, 1] against the 8-bit target; at most [`MAX_PSNR_DB`]. Not a number where the image is none.
+///
+/// # Panics
+/// If the sizes differ.
+pub fn psnr(image: &ImageF32, target: &LossTarget) -> f64 {
+    assert_eq!((image.width as usize, image.height as usize), target.size(), "image and photograph differ in size");
+    let width = image.width as usize;
+    let mask = target.mask();
+    // Sums per row, added in row order: the same on any number of threads.
+    let rows: Vec<(f64, usize)> = image
+        .data
+        .par_chunks(3 * width)
+        .zip(target.rgb().par_chunks(3 * width))
+        .enumerate()
+        .map(|(r, (found, expected))| {
+            let (mut sum, mut num_pixels) = (0.0, 0);
+            for (j, (x, y)) in found.chunks_exact(3).zip(expected.chunks_exact(3)).enumerate() {
+                if mask.is_some_and(|m| m[r * width + j] == 0) {
+                    continue;
+                }
+                num_pixels += 1;
+                for c in 0..3 {
+                    let d = f64::from(x[c].clamp(0.0, 1.0)) - f64::from(y[c]) / 255.0;
+                    sum += d * d;
+                }
+            }
+            (sum, num_pixels)
+        })
+        .collect();
+    let (sum, num_pixels) = rows.iter().fold((0.0, 0), |a, r| (a.0 + r.0, a.1 + r.1));
+    let mse = sum / (3 * num_pixels.max(1)) as f64;
+    let db = -10.0 * mse.log10();
+    if db > MAX_PSNR_DB { MAX_PSNR_DB } else { db }
+}
+
+/// Mean SSIM, with the windows and the treatment of borders and masks of the training loss, of `image` clamped to [0, 1].
+///
+/// # Panics
+/// If the sizes differ.
+pub fn ssim(image: &ImageF32, target: &LossTarget) -> f64 {
+    let (width, height) = target.size();
+    assert_eq!((image.width as usize, image.height as usize), (width, height), "image and photograph differ in size");
+    let clamped: Vec<f32> = image.data.iter().map(|v| v.clamp(0.0, 1.0)).collect();
+    let comparison =
+        Comparison { width, height, channels: 3, image: &clamped, target: target.rgb(), mask: target.mask() };
+    similarity(&comparison).ssim
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gazesplat_core::image::RgbImage8;
+    use gazesplat_core::io::images::TrainingImage;
+    use std::sync::Arc;
+
+    fn target(mask: Option<Vec<u8>>) -> LossTarget {
+        let image = RgbImage8 { width: 4, height: 3, data: vec![51; 36] };
+        LossTarget::new(Arc::new(TrainingImage { image, alpha: None, mask }), [0.0; 3])
+    }
+
+    #[test]
+    fn psnr_of_a_constant_difference() {
+        let image = ImageF32 { width: 4, height: 3, data: vec![0.3; 36] };
+        assert!((psnr(&image, &target(None)) - 20.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn equal_images_have_the_largest_values() {
+        let image = ImageF32 { width: 4, height: 3, data: vec![0.2; 36] };
+        assert_eq!(psnr(&image, &target(None)), MAX_PSNR_DB);
+        assert!((ssim(&image, &target(None)) - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn values_beyond_the_range_are_clamped_and_masked_pixels_ignored() {
+        let mut data = vec![0.2; 36];
+        data[..3].copy_from_slice(&[-4.0, 9.0, 0.0]);
+        let image = ImageF32 { width: 4, height: 3, data };
+        let mut mask = vec![1; 12];
+        assert!((psnr(&image, &target(None)) + 10.0 * ((0.04 + 0.64 + 0.04f64) / 36.0).log10()).abs() < 1e-5);
+        mask[0] = 0;
+        assert_eq!(psnr(&image, &target(Some(mask))), MAX_PSNR_DB);
+    }
+}

@@ -1,0 +1,67 @@
+//! `gazesplat eval`: how close a model comes to the photographs of a scene.
+
+use super::{Model, Split, load_scene, on_threads, quality};
+use crate::cli::SettingsArgs;
+use crate::console::{Console, grouped};
+use crate::diagnostics::{Failure, Result};
+use crate::run_dir;
+use clap::Args;
+use gazesplat_core::io::images::ImageCache;
+use gazesplat_render::{Splats, cpu_device};
+use std::path::PathBuf;
+
+/// Arguments of `eval`.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  gazesplat eval runs/fox-1 --scene fox
+  gazesplat eval model.ply --scene fox --split all --set data.max_side=480 > eval.json
+  gazesplat eval runs/fox-1 --scene fox --min-psnr 25 || echo worse than 25 dB
+
+A run is measured with the settings it was trained with (image size, split, background); a PLY file with the defaults.")]
+pub struct EvalArgs {
+    /// A 3DGS PLY file, or the directory of a run
+    pub model: PathBuf,
+    /// The scene with the photographs
+    #[arg(long, value_name = "SCENE")]
+    pub scene: PathBuf,
+    /// Settings
+    #[command(flatten)]
+    pub settings: SettingsArgs,
+    /// Which views of the scene
+    #[arg(long, value_enum, default_value = "test")]
+    pub split: Split,
+    /// Exit with status 1 when the mean PSNR is below this many dB
+    #[arg(long, value_name = "DB")]
+    pub min_psnr: Option<f64>,
+    /// Write the JSON to this file too
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+}
+
+/// Runs `eval`.
+///
+/// # Errors
+/// When the model or the scene cannot be read, or the quality is below `--min-psnr`.
+pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
+    let model = Model::load(&args.model, console)?;
+    let config = model.settings(&args.settings)?;
+    let dataset = load_scene(&args.scene, &config, console)?;
+    let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
+    let report = on_threads(config.train.threads, || {
+        let splats = Splats::from_cloud(&model.cloud, &cpu_device());
+        quality::measure(&splats, &images, &config.render_options(), console)
+    })?;
+    if let Some(out) = &args.out {
+        run_dir::write_text(out, &format!("{}\n", run_dir::to_json(&report)))?;
+    }
+    console.note(quality::table(&report));
+    console.note(format_args!("{} Gaussians", grouped(report.num_gaussians)));
+    console.json(&report)?;
+    match args.min_psnr {
+        Some(min) if report.psnr < min => {
+            Err(Failure::check_failed(format!("mean PSNR is {:.2} dB, at least {min} dB was asked for", report.psnr)))
+        }
+        _ => Ok(()),
+    }
+}

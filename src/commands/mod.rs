@@ -1,0 +1,161 @@
+//! The commands of the program, one file each, and what several of them share: scenes, models, threads.
+
+pub mod demo;
+pub mod eval;
+pub mod info;
+pub mod render;
+pub mod synth;
+pub mod train;
+
+mod frames;
+mod quality;
+mod record;
+
+use crate::cli::SettingsArgs;
+use crate::console::{Console, grouped};
+use crate::diagnostics::{Failure, Result};
+use crate::run_dir::RunDir;
+use crate::settings::Settings;
+use gazesplat_core::dataset::LoadOptions;
+use gazesplat_core::io::ply;
+use gazesplat_core::{Dataset, GaussianCloud, View};
+use gazesplat_train::Config;
+use std::path::{Path, PathBuf};
+
+/// Which views of a scene.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Split {
+    /// The views training uses
+    Train,
+    /// The views kept for measurement
+    Test,
+    /// Every view
+    All,
+}
+
+impl Split {
+    /// The views of `dataset` in this split, sorted by name.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn views(self, dataset: &Dataset, scene: &Path) -> Result<Vec<View>> {
+        let views = match self {
+            Self::Train => dataset.train.clone(),
+            Self::Test => dataset.test.clone(),
+            Self::All => dataset.all_views().into_iter().cloned().collect(),
+        };
+        if views.is_empty() {
+            let name = if self == Self::Train { "train" } else { "test" };
+            return Err(Failure::new(format!("`{}` has no {name} views", scene.display()))
+                .hint("`--split all` takes every view; `--set data.test_every=8` keeps every 8th view for testing"));
+        }
+        Ok(views)
+    }
+}
+
+/// Loads a scene as the settings ask, and tells what was odd about it.
+///
+/// # Errors
+/// When the scene cannot be read.
+pub fn load_scene(scene: &Path, config: &Config, console: &Console) -> Result<Dataset> {
+    let options = LoadOptions {
+        max_side: config.data.max_side,
+        images: config.data.images.clone(),
+        test_every: config.data.test_every,
+        ..LoadOptions::default()
+    };
+    let dataset = Dataset::load(scene, &options)?;
+    for warning in &dataset.warnings {
+        console.warn(warning);
+    }
+    Ok(dataset)
+}
+
+/// Name of the scene in directory `scene`: `../shared/fox/` is `fox`.
+pub fn scene_name(scene: &Path) -> String {
+    let absolute = std::path::absolute(scene).unwrap_or_else(|_| scene.to_owned());
+    let normal = absolute.components().filter_map(|c| match c {
+        std::path::Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
+        _ => None,
+    });
+    normal.last().unwrap_or_else(|| "scene".to_owned())
+}
+
+/// A model as given on the command line.
+#[derive(Debug)]
+pub struct Model {
+    /// The Gaussians.
+    pub cloud: GaussianCloud,
+    /// The PLY file.
+    pub path: PathBuf,
+    /// The run it was given as, if it was a directory.
+    pub run: Option<RunDir>,
+}
+
+impl Model {
+    /// Reads a PLY file, or the model of a run directory.
+    ///
+    /// # Errors
+    /// When there is no model at `path`, or it cannot be read.
+    pub fn load(path: &Path, console: &Console) -> Result<Self> {
+        let run = if path.is_dir() { Some(RunDir::open(path)?) } else { None };
+        let file = run.as_ref().map_or_else(|| path.to_owned(), RunDir::model_path);
+        let (cloud, report) = ply::load_with_report(&file)?;
+        if report.num_dropped_non_finite > 0 {
+            console.warn(format_args!(
+                "`{}`: left out {} of {} Gaussians with values that are not finite",
+                file.display(),
+                grouped(report.num_dropped_non_finite),
+                grouped(report.num_rows)
+            ));
+        }
+        if report.num_dropped_zero_quat > 0 {
+            console.warn(format_args!(
+                "`{}`: left out {} of {} Gaussians without a rotation",
+                file.display(),
+                grouped(report.num_dropped_zero_quat),
+                grouped(report.num_rows)
+            ));
+        }
+        Ok(Self { cloud, path: file, run })
+    }
+
+    /// Settings for working with this model: those of its run, if it was given as one, under those of the command line.
+    ///
+    /// # Errors
+    /// When a settings file or value is wrong.
+    pub fn settings(&self, args: &SettingsArgs) -> Result<Config> {
+        let file = self.run.as_ref().map(RunDir::settings_path).filter(|p| p.is_file());
+        let settings = match &file {
+            Some(file) => Settings::new().with_file(file)?,
+            None => Settings::new(),
+        };
+        layered(settings, args)?.resolve()
+    }
+}
+
+/// `--config` and `--set` over `settings`.
+pub(crate) fn layered(settings: Settings, args: &SettingsArgs) -> Result<Settings> {
+    let settings = match &args.config {
+        Some(config) => settings.with_config(config)?,
+        None => settings,
+    };
+    settings.with_overrides(&args.overrides)
+}
+
+/// Runs `work` on `num_threads` threads, 0 for all cores.
+pub(crate) fn on_threads<T: Send>(num_threads: usize, work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(num_threads).build();
+    pool.map_err(|e| Failure::new(format!("cannot start {num_threads} threads: {e}")))?.install(work)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scene_is_named_by_its_directory() {
+        assert_eq!(scene_name(Path::new("../shared/fox/")), "fox");
+        assert_eq!(scene_name(Path::new("/")), "scene");
+    }
+}

@@ -1,0 +1,410 @@
+//! Settings in layers: defaults, a preset or TOML file, then `--set key=value`, the later one winning.
+//!
+//! A key that does not exist is refused with the nearest one that does, a value of the wrong type with what was
+//! expected; for files the place is shown. The tree of known keys is the serialised default [`Config`], so this file
+//! names no key and cannot fall behind.
+
+use crate::diagnostics::{Failure, Result, nearest};
+use gazesplat_train::Config;
+use serde_json::Value as Json;
+use std::ops::Range;
+use std::path::Path;
+use toml::Table;
+use toml::de::{DeTable, DeValue};
+
+/// Presets that come with the program, by name: each holds only what differs from the defaults.
+pub const PRESETS: [(&str, &str); 2] = [
+    ("quick", include_str!("../configs/train/quick.toml")),
+    ("quality", include_str!("../configs/train/quality.toml")),
+];
+
+/// The values given so far, without the defaults.
+#[derive(Debug, Clone, Default)]
+pub struct Settings {
+    table: Table,
+}
+
+impl Settings {
+    /// No value given: all defaults.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Layers a preset (`quick`) or a TOML file over the values so far; an existing file wins over a preset of that name.
+    ///
+    /// # Errors
+    /// When there is neither such a file nor such a preset, when it is no TOML, or holds an unknown key or a wrong value.
+    pub fn with_config(self, name_or_path: &Path) -> Result<Self> {
+        let preset = PRESETS.iter().find(|(name, _)| Path::new(name) == name_or_path);
+        match preset {
+            Some((name, text)) if !name_or_path.exists() => self.with_text(Path::new(&format!("preset {name}")), text),
+            _ => self.with_file(name_or_path),
+        }
+    }
+
+    /// Layers a TOML file over the values so far.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is no TOML, or holds an unknown key or a wrong value.
+    pub fn with_file(self, path: &Path) -> Result<Self> {
+        let text = std::fs::read_to_string(path).map_err(|e| {
+            Failure::io("read", path, e).hint(format!(
+                "give a TOML file or one of the presets {}",
+                PRESETS.map(|(name, _)| format!("`{name}`")).join(", ")
+            ))
+        })?;
+        self.with_text(path, &text)
+    }
+
+    fn with_text(mut self, path: &Path, text: &str) -> Result<Self> {
+        let at = |problem: Problem| {
+            let failure = Failure::new(format!("`{}`: {}", path.display(), problem.message)).hint_if(problem.hint);
+            match problem.span {
+                Some(span) => failure.excerpt(path, text, span, problem.label),
+                None => failure,
+            }
+        };
+        let document = DeTable::parse(text).map_err(|e| at(Problem::from_toml(&e)))?;
+        check_table(document.get_ref(), &known_keys(), "").map_err(&at)?;
+        // A second reading by the types themselves: names of variants, ranges of integers.
+        toml::from_str::<Config>(text).map_err(|e| at(Problem::from_toml(&e).of_value("", &Json::Null)))?;
+        let layer: Table = toml::from_str(text).map_err(|e| at(Problem::from_toml(&e)))?;
+        merge(&mut self.table, layer);
+        Ok(self)
+    }
+
+    /// Layers one `key=value` over the values so far. The value is TOML; text needs no quotes and a list no brackets.
+    ///
+    /// # Errors
+    /// When the key is unknown or the value does not fit it.
+    pub fn with_override(self, assignment: &str) -> Result<Self> {
+        let refuse =
+            |problem: Problem| Failure::new(format!("`--set {assignment}`: {}", problem.message)).hint_if(problem.hint);
+        let Some((key, raw)) = assignment.split_once('=') else {
+            return Err(refuse(Problem::new("expected `key=value`").hint("for example `--set train.steps=3000`")));
+        };
+        let (key, raw) = (key.trim(), raw.trim());
+        let keys = known_keys();
+        let is_key = !key.is_empty() && key.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.'));
+        if !is_key || find(&keys, key).is_none_or(Json::is_object) {
+            return Err(refuse(unknown_key(key, &keys)));
+        }
+        let quoted = toml::Value::String(raw.to_owned()).to_string();
+        let readings = [raw.to_owned(), quoted, format!("[{raw}]")];
+        let mut first_problem = None;
+        for reading in readings {
+            match self.with_assignment(key, &reading, &keys) {
+                Ok(settings) => return Ok(settings),
+                // Bare text is no TOML; the reading in quotes has the better reason.
+                Err(_) if DeTable::parse(&format!("v = {reading}")).is_err() => {}
+                Err(problem) => {
+                    first_problem.get_or_insert(problem);
+                }
+            }
+        }
+        Err(refuse(first_problem.unwrap_or_else(|| Problem::new(format!("`{raw}` is not a value")))))
+    }
+
+    fn with_assignment(&self, key: &str, value: &str, keys: &Json) -> std::result::Result<Self, Problem> {
+        let text = format!("{key} = {value}\n");
+        let document = DeTable::parse(&text).map_err(|e| Problem::from_toml(&e))?;
+        check_table(document.get_ref(), keys, "")?;
+        let layer: Table = toml::from_str(&text).map_err(|e| Problem::from_toml(&e))?;
+        layer.clone().try_into::<Config>().map_err(|e| Problem::from_toml(&e).of_value(key, keys))?;
+        let mut next = self.clone();
+        merge(&mut next.table, layer);
+        Ok(next)
+    }
+
+    /// Layers several `key=value`, in order.
+    ///
+    /// # Errors
+    /// As [`Settings::with_override`], for the first that is wrong.
+    pub fn with_overrides(self, assignments: &[String]) -> Result<Self> {
+        assignments.iter().try_fold(self, |settings, a| settings.with_override(a))
+    }
+
+    /// The defaults with the given values over them.
+    ///
+    /// # Errors
+    /// When the values contradict each other or are out of their range.
+    pub fn resolve(&self) -> Result<Config> {
+        let config: Config =
+            self.table.clone().try_into().map_err(|e: toml::de::Error| Failure::new(e.message().to_owned()))?;
+        config.validate()?;
+        Ok(config)
+    }
+}
+
+/// The resolved settings as TOML, every key present that has a value.
+pub fn to_toml(config: &Config) -> String {
+    toml::to_string_pretty(config).expect("settings are plain tables of numbers and text")
+}
+
+/// Every key with its default, as `train.steps = 30000`: the list that `train --help` shows.
+pub fn describe_keys() -> String {
+    let mut lines = Vec::new();
+    leaves(&known_keys(), "", &mut |path, default| {
+        lines.push(if default.is_null() { format!("  {path}") } else { format!("  {path} = {}", show(default)) });
+    });
+    lines.join("\n")
+}
+
+/// What is wrong with one value, before it is known where it came from.
+#[derive(Debug)]
+struct Problem {
+    message: String,
+    hint: Option<String>,
+    span: Option<Range<usize>>,
+    label: String,
+}
+
+impl Problem {
+    fn new(message: impl Into<String>) -> Self {
+        Self { message: message.into(), hint: None, span: None, label: "here".to_owned() }
+    }
+
+    fn hint(mut self, hint: impl Into<String>) -> Self {
+        self.hint = Some(hint.into());
+        self
+    }
+
+    fn at(mut self, span: Range<usize>, label: impl Into<String>) -> Self {
+        (self.span, self.label) = (Some(span), label.into());
+        self
+    }
+
+    /// The reason of serde in terms of settings: it knows neither the key nor its default.
+    fn of_value(mut self, key: &str, keys: &Json) -> Self {
+        if self.message.contains("untagged enum") {
+            self.message = "not one of the values it can have".to_owned();
+        }
+        if let Some(default) = find(keys, key) {
+            self.message = format!("`{key}`: {}", self.message);
+            self.hint = Some(format!("the default is `{}`", show(default)));
+        }
+        self
+    }
+
+    fn from_toml(error: &toml::de::Error) -> Self {
+        let mut lines = error.message().lines();
+        let message = lines.next().unwrap_or("not valid TOML").to_owned();
+        Self { message, hint: None, span: error.span(), label: lines.next().unwrap_or("here").to_owned() }
+    }
+}
+
+/// The default settings as a tree of objects whose leaves are default values; `null` for "no default".
+fn known_keys() -> Json {
+    serde_json::to_value(Config::default()).expect("settings are plain tables of numbers and text")
+}
+
+fn find<'a>(keys: &'a Json, path: &str) -> Option<&'a Json> {
+    path.split('.').try_fold(keys, |node, part| node.as_object()?.get(part))
+}
+
+fn leaves<'a>(node: &'a Json, path: &str, visit: &mut impl FnMut(&str, &'a Json)) {
+    match node {
+        Json::Object(table) => {
+            for (key, child) in table {
+                leaves(child, &join(path, key), visit);
+            }
+        }
+        leaf => visit(path, leaf),
+    }
+}
+
+fn join(prefix: &str, key: &str) -> String {
+    if prefix.is_empty() { key.to_owned() } else { format!("{prefix}.{key}") }
+}
+
+fn merge(base: &mut Table, layer: Table) {
+    for (key, value) in layer {
+        match (base.get_mut(&key), value) {
+            (Some(toml::Value::Table(old)), toml::Value::Table(new)) => merge(old, new),
+            (_, value) => {
+                base.insert(key, value);
+            }
+        }
+    }
+}
+
+/// Walks a document beside the tree of known keys.
+fn check_table(table: &DeTable<'_>, keys: &Json, prefix: &str) -> std::result::Result<(), Problem> {
+    for (key, value) in table.iter() {
+        let path = join(prefix, key.get_ref());
+        let Some(default) = find(keys, &path) else {
+            return Err(unknown_key(&path, keys).at(key.span(), "no such key"));
+        };
+        match (value.get_ref(), default) {
+            (DeValue::Table(child), Json::Object(_)) => check_table(child, keys, &path)?,
+            (found, default) => {
+                check_value(&path, found, default).map_err(|p| p.at(value.span(), "wrong kind of value"))?;
+            }
+        }
+    }
+    Ok(())
+}
+
+fn check_value(path: &str, found: &DeValue<'_>, default: &Json) -> std::result::Result<(), Problem> {
+    let fits = match default {
+        Json::Null => true,
+        Json::Bool(_) => matches!(found, DeValue::Boolean(_)),
+        // Some settings take a name or a list; which, their type says when it reads the value.
+        Json::String(_) => matches!(found, DeValue::String(_) | DeValue::Array(_)),
+        Json::Array(_) => matches!(found, DeValue::Array(_)),
+        Json::Object(_) => false,
+        Json::Number(n) if n.is_f64() => matches!(found, DeValue::Float(_) | DeValue::Integer(_)),
+        Json::Number(n) => {
+            matches!(found, DeValue::Integer(i) if !(n.is_u64() && i.as_str().starts_with('-')))
+        }
+    };
+    if fits {
+        return Ok(());
+    }
+    let expected = match default {
+        Json::Bool(_) => "`true` or `false`",
+        Json::String(_) => "text",
+        Json::Array(_) => "a list",
+        Json::Object(_) => "a table of keys",
+        Json::Number(n) if n.is_f64() => "a number",
+        _ => "a whole number, 0 or more",
+    };
+    let problem = Problem::new(format!("`{path}` expects {expected}, found {}", describe(found)));
+    Err(match default {
+        Json::Object(table) => problem.hint(format!("name one of its keys: {}", key_list(table))),
+        _ => problem.hint(format!("the default is `{}`", show(default))),
+    })
+}
+
+fn describe(value: &DeValue<'_>) -> String {
+    match value {
+        DeValue::String(s) => format!("the text `\"{s}\"`"),
+        DeValue::Integer(i) => format!("the whole number `{i}`"),
+        DeValue::Float(f) => format!("the number `{f}`"),
+        DeValue::Boolean(b) => format!("`{b}`"),
+        DeValue::Datetime(d) => format!("the date `{d}`"),
+        DeValue::Array(_) => "a list".to_owned(),
+        DeValue::Table(_) => "a table".to_owned(),
+    }
+}
+
+/// A default as a person would write it in TOML; numbers in their shortest form, since settings are `f32`.
+fn show(value: &Json) -> String {
+    match value {
+        Json::Number(n) => match n.as_f64() {
+            Some(x) if n.is_f64() => format!("{:?}", x as f32),
+            _ => n.to_string(),
+        },
+        Json::Array(items) => format!("[{}]", items.iter().map(show).collect::<Vec<_>>().join(", ")),
+        other => other.to_string(),
+    }
+}
+
+fn key_list(table: &serde_json::Map<String, Json>) -> String {
+    table.keys().map(String::as_str).collect::<Vec<_>>().join(", ")
+}
+
+fn unknown_key(path: &str, keys: &Json) -> Problem {
+    let problem = Problem::new(format!("`{path}` is not a setting"));
+    if let Some(Json::Object(table)) = find(keys, path) {
+        return problem.hint(format!("it is a table; name one of its keys: {}", key_list(table)));
+    }
+    let mut paths = Vec::new();
+    leaves(keys, "", &mut |p, _| paths.push(p.to_owned()));
+    // A section may be misspelt, be missing, or the key may stand in the wrong one.
+    let last = path.rsplit('.').next().unwrap_or(path);
+    let same_key = paths.iter().find(|p| p.rsplit('.').next() == Some(last)).map(String::as_str);
+    let sections = keys.as_object().into_iter().flat_map(|t| t.keys().map(String::as_str));
+    let near = same_key.or_else(|| {
+        if path.contains('.') { nearest(path, paths.iter().map(String::as_str)) } else { nearest(path, sections) }
+    });
+    let near = near.or_else(|| {
+        let section = path.split_once('.').map(|(s, _)| s)?;
+        let siblings = paths.iter().filter(|p| p.split_once('.').is_some_and(|(s, _)| s == section));
+        siblings.max_by(|a, b| strsim::jaro(path, a).total_cmp(&strsim::jaro(path, b))).map(String::as_str)
+    });
+    match near {
+        Some(near) => problem.hint(format!("did you mean `{near}`?")),
+        None => problem.hint("`gazesplat train --help` lists every key"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn refused(text: &str) -> String {
+        format!("{:?}", Settings::new().with_text(Path::new("my.toml"), text).expect_err("must be refused"))
+    }
+
+    fn set_refused(assignment: &str) -> String {
+        format!("{:?}", Settings::new().with_override(assignment).expect_err("must be refused"))
+    }
+
+    #[test]
+    fn later_layers_win() {
+        let settings = Settings::new()
+            .with_text(Path::new("a.toml"), "[train]\nsteps = 10\nseed = 3\n")
+            .and_then(|s| s.with_override("train.steps=20"))
+            .expect("valid");
+        let config = settings.resolve().expect("valid");
+        assert_eq!((config.train.steps, config.train.seed), (20, 3));
+    }
+
+    #[test]
+    fn misspelt_key_is_refused_with_place_and_nearest() {
+        let report = refused("[train]\nsteps = 10\nsede = 3\n");
+        assert!(report.contains("`train.sede` is not a setting"), "{report}");
+        assert!(report.contains("my.toml:3:1"), "{report}");
+        assert!(report.ends_with("hint: did you mean `train.seed`?"), "{report}");
+    }
+
+    #[test]
+    fn key_in_the_wrong_section_is_pointed_home() {
+        assert!(set_refused("cap=5").contains("did you mean `densify.cap`?"));
+        assert!(set_refused("train.cap=5").contains("did you mean `densify.cap`?"));
+        assert!(set_refused("train=5").contains("name one of its keys"));
+    }
+
+    #[test]
+    fn wrong_type_names_key_and_expectation() {
+        let report = refused("[train]\nsteps = \"many\"\n");
+        assert!(report.contains("`train.steps` expects a whole number, 0 or more"), "{report}");
+        assert!(report.contains("found the text `\"many\"`") && report.contains("my.toml:2:9"), "{report}");
+        assert!(set_refused("train.steps=-3").contains("expects a whole number, 0 or more"));
+        assert!(set_refused("train.steps=1.5").contains("found the number `1.5`"));
+        assert!(set_refused("train.steps=many").contains("found the text `\"many\"`"));
+        assert!(set_refused("train.steps").contains("expected `key=value`"));
+    }
+
+    #[test]
+    fn text_needs_no_quotes() {
+        let settings = Settings::new().with_override("data.images=images_4").expect("valid");
+        assert_eq!(settings.resolve().expect("valid").data.images.as_deref(), Some("images_4"));
+    }
+
+    #[test]
+    fn background_takes_a_name_or_a_colour() {
+        for value in ["white", "1,0.5,0", "[1, 0.5, 0]"] {
+            Settings::new().with_override(&format!("data.background={value}")).expect(value);
+        }
+        let report = set_refused("data.background=pink");
+        assert!(report.contains("`data.background`") && report.contains("the default is `\"black\"`"), "{report}");
+    }
+
+    #[test]
+    fn presets_are_valid_and_differ_from_the_defaults() {
+        let defaults = to_toml(&Config::default());
+        for (name, text) in PRESETS {
+            let config = Settings::new().with_text(Path::new(name), text).and_then(|s| s.resolve()).expect(name);
+            assert_ne!(to_toml(&config), defaults, "{name} changes nothing");
+        }
+    }
+
+    #[test]
+    fn resolved_settings_read_back_unchanged() {
+        let config = Settings::new().with_override("train.seed=7").and_then(|s| s.resolve()).expect("valid");
+        let again = Settings::new().with_text(Path::new("s.toml"), &to_toml(&config)).and_then(|s| s.resolve());
+        assert_eq!(to_toml(&again.expect("valid")), to_toml(&config));
+    }
+}

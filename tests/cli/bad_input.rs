@@ -1,0 +1,157 @@
+//! Damaged, missing and misplaced input: a clear error, a hint, status 2, and nothing left half-written.
+
+use crate::support::{Place, SHORT};
+use std::fs;
+
+/// Trains on `scene`, which must be refused without leaving a run behind.
+#[track_caller]
+fn refused(place: &Place) -> String {
+    let said = place.run(&[&["train", "scene", "--out", "out"], SHORT.as_slice()].concat()).refused();
+    assert_eq!(place.list("out"), Vec::<String>::new(), "{said}");
+    said
+}
+
+/// Leaves the COLMAP reconstruction as the only cameras of the scene.
+fn colmap_only() -> Place {
+    let place = Place::with_scene();
+    fs::remove_file(place.path("scene/transforms.json")).expect("there");
+    place
+}
+
+#[test]
+fn missing_directory() {
+    let said = refused(&Place::new());
+    assert!(said.contains("`scene`"), "{said}");
+}
+
+#[test]
+fn directory_without_a_scene() {
+    let place = Place::new();
+    fs::create_dir(place.path("scene")).expect("writable");
+    let said = refused(&place);
+    assert!(said.contains("not a scene") && said.contains("sparse/0"), "{said}");
+}
+
+#[test]
+fn missing_images() {
+    let place = colmap_only();
+    fs::remove_dir_all(place.path("scene/images")).expect("there");
+    let said = refused(&place);
+    assert!(said.contains("images"), "{said}");
+}
+
+#[test]
+fn one_missing_image() {
+    let place = colmap_only();
+    let name = place.list("scene/images").remove(3);
+    fs::remove_file(place.path("scene/images").join(&name)).expect("there");
+    let ended = place.run(&[&["train", "scene", "--out", "out"], SHORT.as_slice()].concat());
+    assert!(ended.stderr.contains(&name), "the file is named:\n{}", ended.stderr);
+    assert!(ended.code == 2 || ended.stderr.contains("warning: "), "{}", ended.stderr);
+}
+
+#[test]
+fn truncated_binary_model() {
+    let place = colmap_only();
+    // One camera is announced and ends after its number and model.
+    let mut cameras = 1_u64.to_le_bytes().to_vec();
+    cameras.extend([1, 0, 0, 0, 1, 0, 0, 0]);
+    place.write("scene/sparse/0/cameras.bin", cameras);
+    place.write("scene/sparse/0/images.bin", 9_u64.to_le_bytes());
+    place.write("scene/sparse/0/points3D.bin", 0_u64.to_le_bytes());
+    let said = refused(&place);
+    assert!(said.contains("cameras.bin"), "{said}");
+}
+
+#[test]
+fn unknown_camera_model() {
+    let place = colmap_only();
+    place.edit("scene/sparse/0/cameras.txt", " PINHOLE ", " CRYSTAL_BALL ");
+    let said = refused(&place);
+    assert!(said.contains("cameras.txt") && said.contains("CRYSTAL_BALL") && said.contains("PINHOLE"), "{said}");
+}
+
+#[test]
+fn image_that_is_no_image() {
+    let place = Place::with_scene();
+    let name = place.list("scene/images").remove(3);
+    place.write(&format!("scene/images/{name}"), "this is no photograph");
+    let said = refused(&place);
+    assert!(said.contains(&name), "{said}");
+}
+
+#[test]
+fn image_that_ends_early() {
+    let place = Place::with_scene();
+    for (index, split) in [(3, "training"), (0, "test")] {
+        let name = place.list("scene/images").remove(index);
+        let whole = fs::read(place.path("scene/images").join(&name)).expect("readable");
+        place.write(&format!("scene/images/{name}"), &whole[..whole.len() / 2]);
+        let said = refused(&place);
+        assert!(said.contains(&name), "{split} view:\n{said}");
+        place.write(&format!("scene/images/{name}"), whole);
+    }
+}
+
+#[test]
+fn no_registered_views() {
+    let place = colmap_only();
+    place.write("scene/sparse/0/images.txt", "# Image list\n");
+    let said = refused(&place);
+    assert!(said.contains("images.txt") || said.contains("views"), "{said}");
+}
+
+#[test]
+fn model_with_missing_attributes() {
+    let place = Place::with_run();
+    place.edit_bytes("run/point_cloud.ply", b"property float opacity\n", b"property float opakity\n");
+    let said = place.run(&["eval", "run", "--scene", "scene"]).refused();
+    assert!(said.contains("point_cloud.ply") && said.contains("opacity"), "{said}");
+}
+
+#[test]
+fn model_that_ends_early() {
+    let place = Place::with_run();
+    let whole = fs::read(place.path("run/point_cloud.ply")).expect("readable");
+    place.write("run/point_cloud.ply", &whole[..whole.len() - 100]);
+    let said = place.run(&["render", "run", "--scene", "scene", "--out", "frames"]).refused();
+    assert!(said.contains("point_cloud.ply"), "{said}");
+    assert!(!place.path("frames").exists());
+}
+
+#[test]
+fn missing_model() {
+    let place = Place::with_scene();
+    let said = place.run(&["eval", "no.ply", "--scene", "scene"]).refused();
+    assert!(said.contains("`no.ply`"), "{said}");
+    let said = place.run(&["eval", "scene", "--scene", "scene"]).refused();
+    assert!(said.contains("`scene` holds no `point_cloud.ply`"), "{said}");
+}
+
+#[test]
+fn directory_that_cannot_be_written() {
+    let place = Place::with_scene();
+    place.write("file", "in the way");
+    let args = [&["train", "scene", "--out", "file/run"], SHORT.as_slice()].concat();
+    let said = place.run(&args).refused();
+    assert!(said.contains("file/run") && said.contains("--out"), "{said}");
+    let said = place.run(&[&["train", "scene", "--out", "file"], SHORT.as_slice()].concat()).refused();
+    assert!(said.contains("`file` is a file"), "{said}");
+    assert_eq!(place.read("file"), "in the way");
+}
+
+#[test]
+fn views_that_would_share_a_file() {
+    let place = Place::with_run();
+    fs::remove_file(place.path("scene/transforms.json")).expect("there");
+    let names = place.list("scene/images");
+    for (dir, name) in [("a", &names[0]), ("b", &names[1])] {
+        fs::create_dir(place.path("scene/images").join(dir)).expect("writable");
+        fs::rename(place.path("scene/images").join(name), place.path("scene/images").join(dir).join("same.png"))
+            .expect("there");
+        place.edit("scene/sparse/0/images.txt", name, &format!("{dir}/same.png"));
+    }
+    let said = place.run(&["render", "run", "--scene", "scene", "--out", "frames"]).refused();
+    assert!(said.contains("`a/same.png` and `b/same.png`"), "{said}");
+    assert!(!place.path("frames").exists());
+}

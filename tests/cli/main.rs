@@ -1,0 +1,13 @@
+//! The program as a person meets it: every command run as a process in a directory of its own.
+//!
+//! One binary for all commands, so that the scene and the run most tests start from are made once.
+
+mod bad_input;
+mod eval;
+mod help;
+mod info;
+mod render;
+mod settings;
+mod support;
+mod synth;
+mod train;

@@ -1,0 +1,136 @@
+//! A directory of its own for each test, a small scene and a small run made once, and the end of a process as text.
+
+use assert_cmd::cargo::cargo_bin_cmd;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
+use tempfile::TempDir;
+
+/// How a process ended.
+pub struct Ended {
+    pub code: i32,
+    pub stdout: String,
+    pub stderr: String,
+}
+
+impl Ended {
+    /// Asserts success.
+    #[track_caller]
+    pub fn done(self) -> Self {
+        assert_eq!(self.code, 0, "stderr:\n{}", self.stderr);
+        self
+    }
+
+    /// Asserts an error of the input: status 2, no data, a hint. Returns what was said.
+    #[track_caller]
+    pub fn refused(self) -> String {
+        assert_eq!(self.code, 2, "stdout:\n{}\nstderr:\n{}", self.stdout, self.stderr);
+        assert_eq!(self.stdout, "");
+        assert!(self.stderr.contains("error: "), "{}", self.stderr);
+        assert!(self.stderr.contains("\nhint: "), "no hint:\n{}", self.stderr);
+        assert!(!self.stderr.contains("panicked"), "{}", self.stderr);
+        self.stderr
+    }
+}
+
+/// A temporary directory in which commands run, so that the paths in their output are short and the same everywhere.
+pub struct Place(TempDir);
+
+impl Place {
+    pub fn new() -> Self {
+        Self(tempfile::tempdir().expect("temporary directory"))
+    }
+
+    /// A place with the small scene in `scene`.
+    pub fn with_scene() -> Self {
+        let place = Self::new();
+        copy(&SCENE.path("scene"), &place.path("scene"));
+        place
+    }
+
+    /// A place with the small scene in `scene` and a run on it in `run`.
+    pub fn with_run() -> Self {
+        let place = Self::with_scene();
+        copy(&RUN.path("run"), &place.path("run"));
+        place
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    pub fn command(&self, args: &[&str]) -> assert_cmd::Command {
+        let mut command = cargo_bin_cmd!("gazesplat");
+        command.args(args).current_dir(self.0.path()).env_remove("RUST_LOG").env("NO_COLOR", "1");
+        command
+    }
+
+    /// Runs `gazesplat` with `args` here.
+    pub fn run(&self, args: &[&str]) -> Ended {
+        let output = self.command(args).output().expect("the program starts");
+        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+        Ended { code: output.status.code().unwrap_or(-1), stdout: text(&output.stdout), stderr: text(&output.stderr) }
+    }
+
+    /// Names in a directory, sorted; empty when there is none.
+    pub fn list(&self, name: &str) -> Vec<String> {
+        let Ok(entries) = fs::read_dir(self.path(name)) else { return Vec::new() };
+        let mut names: Vec<String> =
+            entries.map(|e| e.expect("readable").file_name().to_string_lossy().into_owned()).collect();
+        names.sort();
+        names
+    }
+
+    pub fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
+    }
+
+    pub fn write(&self, name: &str, content: impl AsRef<[u8]>) {
+        fs::write(self.path(name), content).expect("writable");
+    }
+
+    /// Replaces text in a file, wherever it stands.
+    pub fn edit(&self, name: &str, from: &str, to: &str) {
+        let text = self.read(name);
+        assert!(text.contains(from), "{name} has no `{from}`");
+        self.write(name, text.replace(from, to));
+    }
+
+    /// Replaces bytes of a file by as many others.
+    pub fn edit_bytes(&self, name: &str, from: &[u8], to: &[u8]) {
+        let mut bytes = fs::read(self.path(name)).expect("readable");
+        let at =
+            bytes.windows(from.len()).position(|w| w == from).unwrap_or_else(|| panic!("{name} lacks these bytes"));
+        bytes[at..at + from.len()].copy_from_slice(to);
+        self.write(name, bytes);
+    }
+}
+
+/// Options of a training that is over in a moment.
+pub const SHORT: [&str; 8] =
+    ["--set", "train.steps=40", "--set", "densify.cap=600", "--set", "train.threads=2", "--set", "model.sh_degree=1"];
+
+static SCENE: LazyLock<Place> = LazyLock::new(|| {
+    let place = Place::new();
+    place.run(&["synth", "--out", "scene", "--views", "9", "--size", "64x48", "--points", "400"]).done();
+    place
+});
+
+static RUN: LazyLock<Place> = LazyLock::new(|| {
+    let place = Place::with_scene();
+    place.run(&[&["train", "scene", "--out", "run"], SHORT.as_slice()].concat()).done();
+    place
+});
+
+fn copy(from: &Path, to: &Path) {
+    fs::create_dir_all(to).expect("writable");
+    for entry in fs::read_dir(from).expect("readable") {
+        let entry = entry.expect("readable");
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy(&entry.path(), &target);
+        } else {
+            fs::copy(entry.path(), target).expect("writable");
+        }
+    }
+}

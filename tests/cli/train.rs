@@ -1,0 +1,134 @@
+//! `gazesplat train`: the run directory, progress, stopping.
+
+use crate::support::{Place, SHORT};
+use serde_json::Value;
+
+fn train(place: &Place, more: &[&str]) -> crate::support::Ended {
+    place.run(&[&["train", "scene"], SHORT.as_slice(), more].concat())
+}
+
+#[test]
+fn run_directory_holds_the_five_files() {
+    let place = Place::with_run();
+    let files = ["eval.json", "metrics.jsonl", "point_cloud.ply", "report.html", "settings.toml"];
+    assert_eq!(place.list("run"), files);
+}
+
+#[test]
+fn metrics_are_one_object_per_logged_step() {
+    let place = Place::with_run();
+    let lines: Vec<Value> =
+        place.read("run/metrics.jsonl").lines().map(|l| serde_json::from_str(l).expect("JSON")).collect();
+    let steps: Vec<u64> = lines.iter().map(|l| l["step"].as_u64().expect("step")).collect();
+    assert_eq!(steps, [1, 10, 20, 30, 40]);
+    for line in &lines {
+        assert!(line["loss"].is_f64() && line["terms"].is_object() && line["num_gaussians"].is_u64(), "{line}");
+        for stage in ["image", "forward", "loss", "backward", "optim", "densify", "total"] {
+            assert!(line["step_ms"][stage].is_number(), "{stage}: {line}");
+        }
+    }
+    assert!(lines[4]["test"]["psnr"].is_f64());
+}
+
+#[test]
+fn evaluation_has_the_promised_fields() {
+    let place = Place::with_run();
+    let eval: Value = serde_json::from_str(&place.read("run/eval.json")).expect("JSON");
+    let keys: Vec<&String> = eval.as_object().expect("object").keys().collect();
+    assert_eq!(keys, ["num_gaussians", "psnr", "ssim", "views"]);
+    let views = eval["views"].as_array().expect("list");
+    assert_eq!(views.len(), 2, "views 0 and 8 of 9");
+    assert!(views.iter().all(|v| v["name"].is_string() && v["psnr"].is_f64() && v["ssim"].is_f64()));
+}
+
+#[test]
+fn report_is_complete_in_itself() {
+    let report = Place::with_run().read("run/report.html");
+    for part in
+        ["<h1>scene</h1>", "Test views", "data:image/jpeg;base64,", "<svg class=\"plot\"", "forward", "cap = 600"]
+    {
+        assert!(report.contains(part), "{part}");
+    }
+    assert!(!report.contains("src=\"http") && !report.contains("<link"));
+}
+
+#[test]
+fn finished_run_is_not_replaced_unless_asked() {
+    let place = Place::with_run();
+    let before = place.read("run/metrics.jsonl");
+    let said = train(&place, &["--out", "run"]).refused();
+    assert!(said.contains("`run` already holds a run") && said.contains("--overwrite"), "{said}");
+    assert_eq!(place.read("run/metrics.jsonl"), before);
+    train(&place, &["--out", "run", "--overwrite"]).done();
+}
+
+#[test]
+fn runs_without_a_name_are_numbered() {
+    let place = Place::with_scene();
+    for _ in 0..2 {
+        train(&place, &["--set", "train.steps=1"]).done();
+    }
+    assert_eq!(place.list("runs"), ["scene-1", "scene-2"]);
+}
+
+#[test]
+fn quiet_says_nothing_and_otherwise_the_result_is_said() {
+    let place = Place::with_scene();
+    let quiet = train(&place, &["--out", "a", "--quiet"]).done();
+    assert_eq!((quiet.stdout.as_str(), quiet.stderr.as_str()), ("", ""));
+    let told = train(&place, &["--out", "b"]).done();
+    assert_eq!(told.stdout, "");
+    assert!(told.stderr.contains("scene: 7 training views, 2 test views, 400 points"), "{}", told.stderr);
+    assert!(told.stderr.contains("b: ") && told.stderr.contains(" dB PSNR"), "{}", told.stderr);
+}
+
+#[test]
+fn scene_without_points_starts_from_random_gaussians_and_says_so() {
+    let place = Place::with_scene();
+    place.edit("scene/sparse/0/points3D.txt", "\n", "\n# ");
+    let told = train(&place, &["--out", "out", "--set", "init.random_points=300"]).done();
+    assert!(told.stderr.contains("warning: the scene has no usable points: 300 random Gaussians"), "{}", told.stderr);
+    assert!(place.path("out/point_cloud.ply").exists());
+}
+
+#[test]
+fn every_view_may_train() {
+    let place = Place::with_scene();
+    let told = train(&place, &["--out", "out", "--set", "data.test_every=0", "--set", "train.steps=2"]).done();
+    assert!(told.stderr.contains("quality is measured on the training views"), "{}", told.stderr);
+    let eval: Value = serde_json::from_str(&place.read("out/eval.json")).expect("JSON");
+    assert_eq!(eval["views"].as_array().map(Vec::len), Some(9));
+}
+
+#[test]
+fn gpu_is_refused_with_the_way_out() {
+    let said = Place::with_scene().run(&["train", "scene", "--device", "gpu"]).refused();
+    assert!(said.contains("hint: use `--device cpu`"), "{said}");
+}
+
+#[cfg(unix)]
+#[test]
+fn interrupt_saves_what_there_is() {
+    use std::process::{Command, Stdio};
+    use std::time::{Duration, Instant};
+    let place = Place::with_scene();
+    let mut child = Command::new(assert_cmd::cargo::cargo_bin!("gazesplat"))
+        .args(["train", "scene", "--out", "out", "--set", "train.steps=1000000", "--set", "densify.cap=600"])
+        .current_dir(place.path("."))
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    // The log shows that the loop runs; a machine that needs longer than this to start has other problems.
+    let started = Instant::now();
+    let metrics = place.path("out/metrics.jsonl");
+    while std::fs::metadata(&metrics).map_or(0, |m| m.len()) == 0 && started.elapsed() < Duration::from_secs(60) {
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let status = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+    assert!(status.success() && child.wait().expect("ends").success());
+    let output = child.wait_with_output().expect("ends");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(said.contains("stopped after") && said.contains("saving what there is"), "{said}");
+    let files = ["eval.json", "metrics.jsonl", "point_cloud.ply", "report.html", "settings.toml"];
+    assert_eq!(place.list("out"), files);
+}

@@ -1,5 +1,6 @@
 //! Curves as inline SVG that take their ink from the page, so that they are right in light and dark.
 
+use plotters::coord::combinators::BindKeyPoints;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
 
@@ -7,8 +8,8 @@ use plotters::prelude::*;
 const INK: RGBColor = RGBColor(1, 2, 3);
 const INK_HEX: &str = "#010203";
 
-/// Width and height of a plot in its own units; the page scales it.
-const SIZE: (u32, u32) = (640, 260);
+/// Width and height of a plot in its own units; the page scales it to about this many pixels.
+const SIZE: (u32, u32) = (420, 240);
 
 /// One curve of a plot.
 #[derive(Debug, Clone)]
@@ -50,7 +51,11 @@ pub fn over_steps(curves: &[Curve], scale: Scale, unit: &str) -> Option<String> 
             let pad = 0.06 * (high - low).max(1e-3 * high.abs()).max(1e-9);
             draw(curves, 0.0..x_max, (low - pad)..(high + pad), unit)
         }
-        Scale::Log => draw(curves, 0.0..x_max, ((low * 0.9)..(high * 1.1)).log_scale(), unit),
+        Scale::Log => {
+            let (low, high) = (low * 0.9, high * 1.1);
+            let range = (low..high).log_scale().with_key_points(round_values(low, high));
+            draw(curves, 0.0..x_max, range, unit)
+        }
     };
     // The element scales with the page: its own size becomes the view box alone.
     let (width, height) = SIZE;
@@ -70,12 +75,12 @@ where
         let memory = "an SVG in memory takes every element";
         let mut chart = ChartBuilder::on(&area)
             .margin(8)
-            .margin_right(20)
+            .margin_right(24)
             .x_label_area_size(30)
-            .y_label_area_size(56)
+            .y_label_area_size(58)
             .build_cartesian_2d(x, y)
             .expect(memory);
-        let text = ("sans-serif", 13).into_font().color(&INK.mix(0.75));
+        let text = ("sans-serif", 14).into_font().color(&INK.mix(0.75));
         chart
             .configure_mesh()
             .disable_x_mesh()
@@ -83,7 +88,7 @@ where
             .bold_line_style(INK.mix(0.14))
             .axis_style(INK.mix(0.35))
             .label_style(text)
-            .x_labels(7)
+            .x_labels(6)
             .y_labels(6)
             .x_label_formatter(&|v| step_label(*v))
             .y_label_formatter(&|v| format!("{}{unit}", value_label(*v)))
@@ -100,6 +105,13 @@ where
         area.present().expect(memory);
     }
     svg
+}
+
+/// 1, 2 and 5 times the powers of ten between `low` and `high`, both above zero.
+fn round_values(low: f64, high: f64) -> Vec<f64> {
+    let decades = low.log10().floor() as i32..=high.log10().ceil() as i32;
+    let values = decades.flat_map(|decade| [1.0, 2.0, 5.0].map(|digit| digit * 10_f64.powi(decade)));
+    values.filter(|value| (low..=high).contains(value)).collect()
 }
 
 fn step_label(step: f64) -> String {
@@ -166,6 +178,11 @@ mod tests {
     #[test]
     fn smoothing_keeps_a_constant() {
         assert_eq!(smoothed(&[(0.0, 2.0), (1.0, 2.0)], 10.0), vec![(0.0, 2.0), (1.0, 2.0)]);
+    }
+
+    #[test]
+    fn logarithmic_axis_is_labelled_at_round_values() {
+        assert_eq!(round_values(0.015, 0.4), [0.02, 0.05, 0.1, 0.2]);
     }
 
     #[test]

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 
 const SH_DEGREE: u32 = 3;
 /// Mean width (standard deviation) in units of the mean distance between Gaussians: sets the blends per pixel.
-const WIDTH: f32 = 0.64;
+const WIDTH: f32 = 0.6;
 /// Standard deviation of the logarithm of the width.
 const WIDTH_SPREAD: f32 = 0.4;
 /// Standard deviation of the view-dependent coefficients.

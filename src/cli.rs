@@ -17,8 +17,8 @@ use tracing_subscriber::EnvFilter;
     arg_required_else_help = true,
     max_term_width = 110,
     after_help = "\
-SCENE is a COLMAP directory (`sparse/0` in .bin or .txt, beside `images`), a directory with `transforms.json`
-(nerfstudio, instant-ngp, NeRF-synthetic), or a scene made by `gazesplat synth`.
+SCENE is a COLMAP directory (`sparse/0` in .bin or .txt, beside `images`), a directory with
+`transforms.json` (nerfstudio, instant-ngp, NeRF-synthetic), or made by `gazesplat synth`.
 MODEL is a 3DGS PLY file, or the directory of a run.
 
 Examples:

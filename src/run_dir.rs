@@ -122,7 +122,7 @@ impl RunDir {
     /// # Errors
     /// When the file cannot be written.
     pub fn write_model(&self, cloud: &GaussianCloud) -> Result<()> {
-        Ok(gazesplat_core::io::ply::save(&self.model_path(), cloud)?)
+        Ok(gazesplat_core::io::ply::save(self.model_path(), cloud)?)
     }
 
     /// Writes `eval.json`.

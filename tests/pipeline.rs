@@ -48,7 +48,7 @@ fn synthetic_scene_is_learned_and_the_model_renders_as_measured() {
     let scene = dir.path().join("scene");
     small_scene(&scene);
     let trained = run(&scene, &dir.path().join("run"), &["train.steps=500", "densify.cap=6000", "data.max_side=0"]);
-    // Measured with seed 0: see BENCHMARKS.md; the floor leaves room for changes of the method, not for a broken one.
+    // The floor leaves room for changes of the method, not for a broken one.
     assert!(trained.eval.psnr > 20.0, "{:.2} dB", trained.eval.psnr);
     assert!(trained.eval.num_gaussians <= 6000);
 

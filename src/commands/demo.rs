@@ -33,8 +33,8 @@ Examples:
   gazesplat demo
   gazesplat demo --quick --out /tmp/demo
 
-Makes a procedural room, trains a model of it, measures it on views kept for testing, renders an orbit and writes a
-report. Takes two to three minutes on two cores; --quick some ten seconds, for a first sign of life.")]
+Makes a procedural room, trains a model of it, measures it on views kept for testing, renders an
+orbit and writes a report. Takes two to three minutes on two cores; --quick some ten seconds.")]
 pub struct DemoArgs {
     /// Directory for everything the demo makes; the default is replaced each time
     #[arg(long, value_name = "DIR", default_value = DEFAULT_OUT)]
@@ -131,8 +131,8 @@ impl Size {
             samples_per_side: 3,
             num_points: 12_000,
         },
-        num_steps: 2500,
-        cap: 40_000,
+        num_steps: 3000,
+        cap: 50_000,
         num_frames: 150,
     };
     const QUICK: Self = Self {

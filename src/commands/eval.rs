@@ -18,7 +18,8 @@ Examples:
   gazesplat eval model.ply --scene fox --split all --set data.max_side=480 > eval.json
   gazesplat eval runs/fox-1 --scene fox --min-psnr 25 || echo worse than 25 dB
 
-A run is measured with the settings it was trained with (image size, split, background); a PLY file with the defaults.")]
+A run is measured with the settings it was trained with (image size, split, background), a PLY
+file with the defaults.")]
 pub struct EvalArgs {
     /// A 3DGS PLY file, or the directory of a run
     pub model: PathBuf,

@@ -32,7 +32,7 @@ pub(crate) fn write_pngs(
     }
     create_all(dir)?;
     for (file, camera) in files.iter().zip(cameras) {
-        io::save_png(&dir.join(file), &frame(camera)?)?;
+        io::save_png(dir.join(file), &frame(camera)?)?;
     }
     Ok(())
 }

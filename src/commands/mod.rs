@@ -74,11 +74,11 @@ pub fn load_scene(scene: &Path, config: &Config, console: &Console) -> Result<Da
 /// Name of the scene in directory `scene`: `../shared/fox/` is `fox`.
 pub fn scene_name(scene: &Path) -> String {
     let absolute = std::path::absolute(scene).unwrap_or_else(|_| scene.to_owned());
-    let normal = absolute.components().filter_map(|c| match c {
+    let mut normal = absolute.components().filter_map(|c| match c {
         std::path::Component::Normal(name) => Some(name.to_string_lossy().into_owned()),
         _ => None,
     });
-    normal.last().unwrap_or_else(|| "scene".to_owned())
+    normal.next_back().unwrap_or_else(|| "scene".to_owned())
 }
 
 /// A model as given on the command line.

@@ -6,8 +6,11 @@ use gazesplat_train::{EvalReport, Observer, StageMs, StepReport, TrainEvent};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
+/// A stage's name and where its time is found.
+type Stage = (&'static str, fn(&StageMs) -> f32);
+
 /// The stages of a step in the order of execution, and where their time is found.
-const STAGES: [(&str, fn(&StageMs) -> f32); NUM_STAGES] = [
+const STAGES: [Stage; NUM_STAGES] = [
     ("image", |s| s.image),
     ("forward", |s| s.forward),
     ("loss", |s| s.loss),

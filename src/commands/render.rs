@@ -59,7 +59,7 @@ pub struct RenderArgs {
     /// Print what each frame cost as JSON on standard output
     #[arg(long)]
     pub stats: bool,
-    /// A directory for `<image stem>.png`, or a video FILE.y4m [default: RUN/renders, or renders/<model>]
+    /// A directory for `<image stem>.png`, or a video FILE.y4m [default: RUN/renders, or renders/MODEL]
     #[arg(long, value_name = "DIR|FILE.y4m")]
     pub out: Option<PathBuf>,
 }

@@ -25,7 +25,7 @@ use std::time::Instant;
 #[command(after_help = "\
 Examples:
   gazesplat train my_capture --config quick
-  gazesplat train my_capture --set train.steps=3000 --set data.max_side=480 --set densify.cap=60000 --out runs/small
+  gazesplat train my_capture --set train.steps=3000 --set data.max_side=480 --out runs/small
   gazesplat train my_capture --config my.toml --set train.seed=1
 
 Ctrl-C stops after the current step and keeps what there is; a second Ctrl-C ends at once.")]
@@ -35,7 +35,7 @@ pub struct TrainArgs {
     /// Settings
     #[command(flatten)]
     pub settings: SettingsArgs,
-    /// Directory for the run [default: runs/<scene>-<n>]
+    /// Directory for the run [default: runs/SCENE-N]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Where to compute
@@ -51,7 +51,7 @@ pub struct TrainArgs {
 pub enum DeviceArg {
     /// The processor, all its cores unless train.threads says otherwise
     Cpu,
-    /// A graphics card
+    /// A graphics card: not in this version yet
     Gpu,
 }
 

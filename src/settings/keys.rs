@@ -85,7 +85,7 @@ fn join(prefix: &str, key: &str) -> String {
 }
 
 /// Walks a document beside the tree of known keys.
-pub(super) fn check_table(table: &DeTable<'_>, keys: &Json, prefix: &str) -> std::result::Result<(), Problem> {
+pub(super) fn check_table(table: &DeTable<'_>, keys: &Json, prefix: &str) -> Result<(), Problem> {
     for (key, value) in table.iter() {
         let path = join(prefix, key.get_ref());
         let Some(default) = find(keys, &path) else {
@@ -101,7 +101,7 @@ pub(super) fn check_table(table: &DeTable<'_>, keys: &Json, prefix: &str) -> std
     Ok(())
 }
 
-fn check_value(path: &str, found: &DeValue<'_>, default: &Json) -> std::result::Result<(), Problem> {
+fn check_value(path: &str, found: &DeValue<'_>, default: &Json) -> Result<(), Problem> {
     let fits = match default {
         Json::Null => true,
         Json::Bool(_) => matches!(found, DeValue::Boolean(_)),

@@ -1,7 +1,5 @@
 //! The synthetic scene: pictures, points, and the scene as files.
 
-#![expect(clippy::unwrap_used, reason = "a helper of a test may panic like the test")]
-
 use gazesplat_core::dataset::{LoadOptions, SceneFormat};
 use gazesplat_core::io::images::decode_rgb;
 use gazesplat_core::synthetic::{SynthOptions, SyntheticScene, write_scene};

@@ -1,6 +1,6 @@
 //! Training of 3D Gaussian models: losses, optimiser, densification, the loop, evaluation.
 //!
-//! A [`Trainer`] owns a model and advances it one view at a time; it prints nothing. [`run`] drives it to the end of its
+//! A [`Trainer`] owns a model and advances it one view at a time; it prints nothing. [`run()`] drives it to the end of its
 //! budget, evaluates on the way and tells [`Observer`]s what happens. Sources, as cited in the code: `3DGS` = Kerbl 2023,
 //! `MCMC` = Kheradmand 2024, Wang 2004 (SSIM), Kingma 2015 (Adam).
 

@@ -111,6 +111,22 @@ pub fn dispatch<K: Kernel>(kernel: K) -> K::Output {
     kernel.run(Scalar)
 }
 
+/// Compiles the scalar computation `f` for every level and runs it at [`level`]: wider registers, rounding and square
+/// roots without library calls. Rust never fuses multiply and add by itself, so the bits are the same at every level.
+/// `f` and what it calls must be `#[inline(always)]`.
+#[inline(always)]
+pub fn vectorize<R>(f: impl FnOnce() -> R) -> R {
+    struct Plain<F>(F);
+    impl<R, F: FnOnce() -> R> Kernel for Plain<F> {
+        type Output = R;
+        #[inline(always)]
+        fn run<S: Simd>(self, _: S) -> R {
+            (self.0)()
+        }
+    }
+    dispatch(Plain(f))
+}
+
 /// Asks for the cache line of `value` ahead of its use. Worth a tenth of the forward rasteriser (`benches/passes.rs`).
 #[inline(always)]
 pub fn prefetch<T>(value: &T) {
@@ -126,6 +142,7 @@ pub fn prefetch<T>(value: &T) {
 
 /// 2ᵖ of [`Simd::exp2`] as a degree-5 polynomial in the fraction f ∈ [−½, ½]: minimax in relative error with the
 /// constant term pinned to 1, highest power first. Largest relative error 1.1e-7 in exact arithmetic.
+#[expect(clippy::approx_constant, reason = "the last coefficient is fitted, not ln 2")]
 pub const EXP2_POLYNOMIAL: [f32; 5] = [1.326_47e-3, 9.671_51e-3, 5.550_734e-2, 2.402_224_2e-1, 6.931_47e-1];
 
 /// 1.5 · 2²³: adding it to |p| < 2²² rounds p to an integer, which then stands in the low mantissa bits.

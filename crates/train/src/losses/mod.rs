@@ -2,6 +2,9 @@
 
 pub mod l1_ssim;
 pub mod ssim_kernel;
+mod ssim_rows;
+#[cfg(test)]
+mod ssim_tests;
 
 pub use l1_ssim::L1Ssim;
 

@@ -15,6 +15,7 @@ use crate::layout::{MAX_PAIRS, TILE, lane};
 use crate::math::alpha::contour_power2;
 use crate::math::conic::{Boundary, boundary, row_span};
 use crate::math::vec::Sym2;
+use crate::simd::vectorize;
 use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -76,6 +77,7 @@ struct Entry {
 }
 
 /// Indices of the tiles along one axis whose pixel centres come within [low, high]: `count` tiles, `size` pixels.
+#[expect(clippy::neg_cmp_op_on_partial_ord, reason = "the comparisons must fail for NaN")]
 #[inline(always)]
 fn tiles_touched(low: f32, high: f32, size: u32, count: u32) -> Range<u32> {
     let tile = TILE as f32;
@@ -158,16 +160,19 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
     let ends = (0..rows.len().div_ceil(CHUNK)).map(|c| entry_offsets[((c + 1) * CHUNK).min(rows.len())]);
     split_at_offsets(&mut entries, ends).into_par_iter().enumerate().for_each(|(chunk, entries)| {
         let mut entries = entries.iter_mut();
-        for splat in chunk * CHUNK..((chunk + 1) * CHUNK).min(rows.len()) {
-            let s = &rows[splat];
-            let contour = contour(s);
-            for row in tile_row_ranges[splat].clone() {
-                let span = tile_span(contour, s[lane::MEAN_X], s[lane::MEAN_Y], &grid, row);
-                if let Some(entry) = entries.next() {
-                    *entry = Entry { splat: splat as u32, first_tile: span.start, end_tile: span.end, record: 0 };
+        vectorize(
+            #[inline(always)]
+            || {
+                for splat in chunk * CHUNK..((chunk + 1) * CHUNK).min(rows.len()) {
+                    let s = &rows[splat];
+                    let contour = contour(s);
+                    for (row, entry) in tile_row_ranges[splat].clone().zip(&mut entries) {
+                        let span = tile_span(contour, s[lane::MEAN_X], s[lane::MEAN_Y], &grid, row);
+                        *entry = Entry { splat: splat as u32, first_tile: span.start, end_tile: span.end, record: 0 };
+                    }
                 }
-            }
-        }
+            },
+        );
     });
     // 3. Records: the pairs in splat order.
     let mut record_offsets = Vec::with_capacity(rows.len() + 1);

@@ -13,6 +13,7 @@ use crate::math::ewa::{Linearization, ViewParams, linearize, project_factor, to_
 use crate::math::quat::{Quat, UnitQuat, normalize, rotation};
 use crate::math::sh;
 use crate::math::vec::{Mat2x3, Mat3, Sym2, Vec3};
+use crate::simd::vectorize;
 use rayon::prelude::*;
 
 /// Parameters of N Gaussians as slices in C order; see [`gazesplat_core::GaussianCloud`] for their meaning.
@@ -153,16 +154,21 @@ pub fn project(g: &GaussianSlices<'_>, view: &ViewSpec, clusters: Option<&[Clust
                 part.num_culled_by_cluster = range.len() as u64;
                 return part;
             }
-            for i in range {
-                match project_one(g, view, &frustum, i) {
-                    Outcome::Visible(lanes) => {
-                        part.lanes.extend_from_slice(&lanes);
-                        part.global_from_compact.push(i as u32);
+            vectorize(
+                #[inline(always)]
+                || {
+                    for i in range {
+                        match project_one(g, view, &frustum, i) {
+                            Outcome::Visible(lanes) => {
+                                part.lanes.extend_from_slice(&lanes);
+                                part.global_from_compact.push(i as u32);
+                            }
+                            Outcome::Culled => {}
+                            Outcome::NonFinite => part.num_non_finite += 1,
+                        }
                     }
-                    Outcome::Culled => {}
-                    Outcome::NonFinite => part.num_non_finite += 1,
-                }
-            }
+                },
+            );
             part
         })
         .collect();
@@ -186,6 +192,7 @@ fn concatenate(parts: &[ProjectedSplats]) -> ProjectedSplats {
 }
 
 /// Projection of Gaussian `i`.
+#[expect(clippy::neg_cmp_op_on_partial_ord, reason = "the comparison must fail for NaN")]
 #[inline(always)]
 fn project_one(g: &GaussianSlices<'_>, view: &ViewSpec, frustum: &Frustum, i: usize) -> Outcome {
     // 1. Mean in the camera; the comparison is false for NaN.

@@ -17,6 +17,7 @@ use crate::math::ewa::{outer_vjp, project_factor_vjp_n, project_factor_vjp_t, pr
 use crate::math::quat::rotation_vjp;
 use crate::math::sh;
 use crate::math::vec::{Mat3, Sym2, Vec3, row_times};
+use crate::simd::{prefetch, vectorize};
 use rayon::prelude::*;
 
 /// Gradients of the parameters of N Gaussians, shapes as in [`GaussianSlices`].
@@ -81,33 +82,39 @@ pub fn project_bwd(
         .zip(starts.par_windows(2))
         .enumerate()
         .for_each(|(chunk, ((((((means, quats), log_scales), logits), sh), probes), range))| {
-            for compact in range[0]..range[1] {
-                let i = ids[compact] as usize;
-                let row = i - chunk * CLUSTER;
-                let v = sum_records(lists, pair_gradients, compact);
-                let in_image = [v[lane::MEAN_X], v[lane::MEAN_Y], v[grad_lane::ABS_X], v[grad_lane::ABS_Y]];
-                if let Some(probe) = probes.as_chunks_mut::<4>().0.get_mut(row)
-                    && in_image.iter().all(|v| v.is_finite())
-                {
-                    *probe = in_image;
-                }
-                let color = &splats.rows()[compact][lane::RED..lane::RED + 3];
-                let sh_row = sh[row * k3..][..k3].as_chunks_mut::<3>().0;
-                let gradient = row_gradient(g, view, i, &v, color, sh_row);
-                if gradient.is_finite() {
-                    means.as_chunks_mut::<3>().0[row] = gradient.mean;
-                    quats.as_chunks_mut::<4>().0[row] = gradient.quat;
-                    log_scales.as_chunks_mut::<3>().0[row] = gradient.log_scales;
-                    logits[row] = gradient.opacity_logit;
-                } else {
-                    sh_row.fill([0.0; 3]);
-                }
-            }
+            vectorize(
+                #[inline(always)]
+                || {
+                    for (compact, &id) in (range[0]..).zip(&ids[range[0]..range[1]]) {
+                        let i = id as usize;
+                        let row = i - chunk * CLUSTER;
+                        let v = sum_records(lists, pair_gradients, compact);
+                        let in_image = [v[lane::MEAN_X], v[lane::MEAN_Y], v[grad_lane::ABS_X], v[grad_lane::ABS_Y]];
+                        if let Some(probe) = probes.as_chunks_mut::<4>().0.get_mut(row)
+                            && in_image.iter().all(|v| v.is_finite())
+                        {
+                            *probe = in_image;
+                        }
+                        let color = &splats.rows()[compact][lane::RED..lane::RED + 3];
+                        let sh_row = sh[row * k3..][..k3].as_chunks_mut::<3>().0;
+                        let gradient = row_gradient(g, view, i, &v, color, sh_row);
+                        if gradient.is_finite() {
+                            means.as_chunks_mut::<3>().0[row] = gradient.mean;
+                            quats.as_chunks_mut::<4>().0[row] = gradient.quat;
+                            log_scales.as_chunks_mut::<3>().0[row] = gradient.log_scales;
+                            logits[row] = gradient.opacity_logit;
+                        } else {
+                            sh_row.fill([0.0; 3]);
+                        }
+                    }
+                },
+            );
         });
     out
 }
 
 impl RowGradient {
+    #[inline(always)]
     fn is_finite(&self) -> bool {
         let all = self.mean.iter().chain(&self.quat).chain(&self.log_scales).chain(&self.color);
         // A sum of finite values that overflows belongs to a row that is useless anyway.
@@ -115,14 +122,22 @@ impl RowGradient {
     }
 }
 
+/// How many records ahead a pair's gradient is asked for.
+const PREFETCH_AHEAD: usize = 24;
+
 /// Sum over a splat's pairs, in the order of its records.
 #[inline(always)]
 fn sum_records(lists: &TileLists, pair_gradients: &[Record], compact: usize) -> Record {
     let records = lists.record_offsets[compact] as usize..lists.record_offsets[compact + 1] as usize;
     let mut sum = [0.0; grad_lane::COUNT];
-    for &pair in &lists.record_pairs[records] {
-        let record = &pair_gradients[pair as usize];
-        for (s, v) in sum.iter_mut().zip(record) {
+    for r in records {
+        // The pairs of one splat lie in different tiles: each is a cache miss unless asked for ahead.
+        if let Some(&ahead) = lists.record_pairs.get(r + PREFETCH_AHEAD) {
+            let [first, .., last] = &pair_gradients[ahead as usize];
+            prefetch(first);
+            prefetch(last);
+        }
+        for (s, v) in sum.iter_mut().zip(&pair_gradients[lists.record_pairs[r] as usize]) {
             *s += v;
         }
     }

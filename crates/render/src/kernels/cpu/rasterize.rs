@@ -158,7 +158,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
         let (width, height) = (lists.grid.width as usize, lists.grid.height as usize);
         let mut stats = RenderStats::default();
         let mut staged = [Staged::default(); BATCH];
-        for tile_x in 0..lists.grid.tiles_x as usize {
+        for (tile_x, tile_end) in tile_ends.iter_mut().enumerate() {
             let tile = TileRect::new(tile_x, tile_y, width, height);
             let id = tile_y * lists.grid.tiles_x as usize + tile_x;
             let pairs = lists.tile_offsets[id] as usize..lists.tile_offsets[id + 1] as usize;
@@ -168,34 +168,36 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
             let outside = s.and_not(s.mask(u16::MAX), s.mask(tile.lane_bits()));
             for row in &mut rows[..tile.height] {
                 s.store(s.select(outside, s.splat(-1.0), s.splat(1.0)), &mut row.t.0);
+                s.store_i(s.select_i(outside, s.splat_i(-1), s.splat_i(i32::MAX)), &mut row.stop.0);
             }
             let first_pair = pair_stats.len();
             if STATS > 0 {
                 pair_stats.resize(first_pair + list.len(), PairStats::default());
             }
-            // Pixels that have not stopped; the tile ends at 0.
-            let mut alive = (tile.width * tile.height) as u32;
+            let mut alive = true;
             for (batch, indices) in list.chunks(BATCH).enumerate() {
                 stage(splats, indices, &tile, &mut staged);
-                for (k, splat) in staged[..indices.len()].iter().enumerate() {
-                    let index = batch * BATCH + k;
-                    let counters = pair_stats.get_mut(first_pair + index);
-                    let (stopped, num_rows) =
-                        composite::<S, DEPTH, STATS, SMOOTH>(s, splat, index as i32, &mut rows, options, counters);
-                    stats.num_lane_pixels += (num_rows * LANES) as u64;
-                    alive -= stopped;
-                    if alive == 0 {
+                for (part, chunk) in staged[..indices.len()].chunks(CHECK).enumerate() {
+                    for (k, splat) in chunk.iter().enumerate() {
+                        let index = batch * BATCH + part * CHECK + k;
+                        let counters = pair_stats.get_mut(first_pair + index);
+                        let num_rows =
+                            composite::<S, DEPTH, STATS, SMOOTH>(s, splat, index as i32, &mut rows, options, counters);
+                        stats.num_lane_pixels += (num_rows * LANES) as u64;
+                    }
+                    alive = any_alive(s, &rows[..tile.height]);
+                    if !alive {
                         break;
                     }
                 }
-                if alive == 0 {
+                if !alive {
                     break;
                 }
             }
-            // E: where the last pixel stopped; entries before it were worked through.
-            let end = if alive == 0 { last_stop(&rows, &tile) } else { list.len() };
+            // E: where the last pixel stopped; entries before it were worked through, those after it changed nothing.
+            let end = if alive { list.len() } else { last_stop(&rows, &tile) };
             stats.num_pairs_used += end as u64;
-            tile_ends[tile_x] = end as u32;
+            *tile_end = end as u32;
             if STATS > 0 {
                 let counters = &mut pair_stats[first_pair..];
                 super::stats::credit_winners(
@@ -222,7 +224,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
     }
 }
 
-/// Blends one splat into the rows it reaches. Returns the pixels that stopped at it and the rows visited.
+/// Blends one splat into the rows it reaches. Returns the number of rows visited.
 #[inline(always)]
 fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
     s: S,
@@ -231,10 +233,10 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
     rows: &mut [PixelRow; TILE],
     options: &RasterOptions,
     counters: Option<&mut PairStats>,
-) -> (u32, usize) {
+) -> usize {
     let (first, end) = (g.first_row as usize, (g.end_row as usize).min(TILE));
     if first >= end {
-        return (0, 0);
+        return 0;
     }
     // log2 α = yy dy² + xy dx dy + (xx dx² + log2 o)
     let dx = s.sub(s.load(&CENTERS), s.splat(g.mean_x));
@@ -245,7 +247,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
     let (cut, floor) = (s.splat(LOG2_ALPHA_MIN), s.splat(LOG2_ALPHA_MIN - 1.0));
     let alpha_max = s.splat(options.alpha_max);
     let t_stop = s.splat(options.t_stop);
-    let mut stopped = 0;
+    let (zero, position) = (s.splat(0.0), s.splat_i(index));
     let (mut num_blended, mut weight_max, mut weight_sum) = (0, s.splat(0.0), s.splat(0.0));
     for (row, center) in rows[first..end].iter_mut().zip(&CENTERS[first..end]) {
         let dy = s.splat(center - g.mean_y);
@@ -263,26 +265,21 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
         let t_next = s.sub(t, weight);
         // Kerbl 2023, App. C: stop before the splat that would end the pixel.
         let blended = s.and(hit, s.gt(t_next, t_stop));
-        let ended = s.and_not(hit, blended);
         let weight = s.keep(blended, weight);
-        let mut t_new = s.sub(t, weight);
-        if s.bits(ended) != 0 {
-            let now = s.and(ended, s.gt(t, s.splat(0.0)));
-            stopped += s.bits(now).count_ones();
-            t_new = s.select(ended, s.neg_abs(t), t_new);
-            s.store_i(s.select_i(now, s.splat_i(index), s.load_i(&row.stop.0)), &mut row.stop.0);
-        }
-        s.store(t_new, &mut row.t.0);
+        // No branch: in a dense tile some pixel stops at almost every splat.
+        let now = s.and(s.gt(t, zero), s.and_not(hit, blended));
+        s.store(s.select(now, s.neg_abs(t), s.sub(t, weight)), &mut row.t.0);
+        s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
         if STATS == 0 {
-            for c in 0..if DEPTH { 4 } else { 3 } {
-                let sum = s.fma(weight, channels[c], s.load(&row.channels[c].0));
-                s.store(sum, &mut row.channels[c].0);
+            let num = if DEPTH { 4 } else { 3 };
+            for (sum, channel) in row.channels[..num].iter_mut().zip(channels) {
+                s.store(s.fma(weight, channel, s.load(&sum.0)), &mut sum.0);
             }
         } else {
             let best = s.load(&row.best.0);
             let better = s.and(blended, s.gt(weight, best));
             s.store(s.select(better, weight, best), &mut row.best.0);
-            s.store_i(s.select_i(better, s.splat_i(index), s.load_i(&row.best_index.0)), &mut row.best_index.0);
+            s.store_i(s.select_i(better, position, s.load_i(&row.best_index.0)), &mut row.best_index.0);
             weight_max = s.max(weight_max, weight);
             if STATS == 2 {
                 num_blended += s.bits(blended).count_ones();
@@ -295,11 +292,10 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
     {
         counters.weight_max = s.reduce_max(weight_max);
         if STATS == 2 {
-            let zero = s.splat(0.0);
             counters.set_blended(num_blended, s.reduce_sum4(weight_sum, zero, zero, zero)[0]);
         }
     }
-    (stopped, end - first)
+    end - first
 }
 
 /// The test-only smooth cut: α·h(u) and its derivative with respect to α, u = clamp(255 α − 1, 0, 1), h(u) = u²(3 − 2u).
@@ -310,6 +306,16 @@ pub(super) fn smooth_cutoff<S: Simd>(s: S, alpha: S::F) -> (S::F, S::F) {
     let h = s.mul(s.mul(u, u), s.fnma(s.splat(2.0), u, s.splat(3.0)));
     let slope = s.mul(s.mul(s.splat(6.0), u), s.sub(s.splat(1.0), u));
     (s.mul(alpha, h), s.fma(s.mul(alpha, s.splat(255.0)), slope, h))
+}
+
+/// Splats between two looks at whether the tile has ended.
+const CHECK: usize = 8;
+
+/// Whether some pixel has not stopped.
+#[inline(always)]
+fn any_alive<S: Simd>(s: S, rows: &[PixelRow]) -> bool {
+    let largest = rows.iter().fold(s.splat(-1.0), |m, row| s.max(m, s.load(&row.t.0)));
+    s.bits(s.gt(largest, s.splat(0.0))) != 0
 }
 
 /// The largest stop position of the pixels inside the image.
@@ -333,8 +339,8 @@ fn write_colors<const DEPTH: bool>(
         let pixels = &mut image[(y * width + tile.x0) * num..][..tile.width * num];
         for (x, pixel) in pixels.chunks_exact_mut(num).enumerate() {
             let t = row.t.0[x].abs();
-            for c in 0..3 {
-                pixel[c] = row.channels[c].0[x] + t * options.background[c];
+            for ((value, channel), background) in pixel.iter_mut().zip(&row.channels[..3]).zip(&options.background) {
+                *value = channel.0[x] + t * background;
             }
             pixel[3] = 1.0 - t;
             if DEPTH {

@@ -138,9 +138,9 @@ fn load_tile<const DEPTH: bool>(
         row.stop.0[..tile.width].copy_from_slice(&raster.stop[at..at + tile.width]);
         for (x, v) in v_image[at * num..][..tile.width * num].chunks_exact(num).enumerate() {
             let mut background = -v[3];
-            for c in 0..3 {
-                row.upstream[c].0[x] = v[c];
-                background += options.background[c] * v[c];
+            for ((upstream, v), b) in row.upstream.iter_mut().zip(&v[..3]).zip(&options.background) {
+                upstream.0[x] = *v;
+                background += b * v;
             }
             if DEPTH {
                 row.upstream[3].0[x] = v[4];
@@ -205,8 +205,8 @@ fn uncomposite<S: Simd, const DEPTH: bool, const SMOOTH: bool, const ABSOLUTE: b
         let behind = s.load(&row.behind.0);
         let v_alpha = s.fnma(behind, inverse, s.mul(t, value));
         s.store(s.fma(weight, value, behind), &mut row.behind.0);
-        for c in 0..if DEPTH { 4 } else { 3 } {
-            v_channels[c] = s.fma(weight, s.load(&row.upstream[c].0), v_channels[c]);
+        for (sum, upstream) in v_channels[..if DEPTH { 4 } else { 3 }].iter_mut().zip(&row.upstream) {
+            *sum = s.fma(weight, s.load(&upstream.0), *sum);
         }
         // ∂α/∂power = α where it is not clamped.
         let d_alpha = if SMOOTH { s.mul(raw, slope) } else { raw };

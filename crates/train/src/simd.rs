@@ -4,7 +4,7 @@
 //! (AVX-512, AVX2 + FMA, baseline) and picks one by [`gazesplat_render::simd::level`]. The const parameter `FMA` says
 //! whether a fused multiply-add is one instruction: in baseline code `f32::mul_add` is a library call.
 
-use gazesplat_render::simd::{EXP2_POLYNOMIAL, ROUND_MAGIC};
+use gazesplat_render::simd::EXP2_POLYNOMIAL;
 
 /// a · b + c, fused where that is one instruction.
 #[inline(always)]
@@ -16,15 +16,15 @@ pub(crate) fn fma<const FMA: bool>(a: f32, b: f32, c: f32) -> f32 {
 #[inline(always)]
 pub(crate) fn exp<const FMA: bool>(x: f32) -> f32 {
     let p = (x * std::f32::consts::LOG2_E).clamp(-126.0, 127.5);
-    let rounded = p + ROUND_MAGIC;
-    let f = p - (rounded - ROUND_MAGIC);
+    let floor = p.floor();
+    let f = p - floor;
     let mut poly = EXP2_POLYNOMIAL[0];
     for c in &EXP2_POLYNOMIAL[1..] {
         poly = fma::<FMA>(poly, f, *c);
     }
     poly = fma::<FMA>(poly, f, 1.0);
-    // The low bits of `rounded` hold the integer; shifted into the exponent they scale the polynomial.
-    f32::from_bits(poly.to_bits().wrapping_add(rounded.to_bits() << 23))
+    // The polynomial lies in [1, 2): the integer part goes into its exponent.
+    f32::from_bits(poly.to_bits().wrapping_add((floor as i32 as u32) << 23))
 }
 
 /// Sum of `values` in 16 interleaved partial sums, combined in `f64`: the same order at every vector width.

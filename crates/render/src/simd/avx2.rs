@@ -146,16 +146,18 @@ impl Simd for Avx2 {
         unsafe { Pair(_mm256_cmp_ps::<_CMP_GT_OQ>(a.0, b.0), _mm256_cmp_ps::<_CMP_GT_OQ>(a.1, b.1)) }
     }
     #[inline(always)]
-    fn gt_i(self, a: Self::I, b: Self::I) -> Self::M {
+    fn gt_where(self, m: Self::M, a: Self::F, b: Self::F) -> Self::M {
+        let gt = self.gt(a, b);
         // SAFETY: the token proves AVX2 and FMA.
-        unsafe {
-            Pair(_mm256_castsi256_ps(_mm256_cmpgt_epi32(a.0, b.0)), _mm256_castsi256_ps(_mm256_cmpgt_epi32(a.1, b.1)))
-        }
+        unsafe { Pair(_mm256_and_ps(m.0, gt.0), _mm256_and_ps(m.1, gt.1)) }
     }
     #[inline(always)]
-    fn and(self, a: Self::M, b: Self::M) -> Self::M {
+    fn gt_i_where(self, m: Self::M, a: Self::I, b: Self::I) -> Self::M {
         // SAFETY: the token proves AVX2 and FMA.
-        unsafe { Pair(_mm256_and_ps(a.0, b.0), _mm256_and_ps(a.1, b.1)) }
+        unsafe {
+            let (g0, g1) = (_mm256_cmpgt_epi32(a.0, b.0), _mm256_cmpgt_epi32(a.1, b.1));
+            Pair(_mm256_and_ps(m.0, _mm256_castsi256_ps(g0)), _mm256_and_ps(m.1, _mm256_castsi256_ps(g1)))
+        }
     }
     #[inline(always)]
     fn and_not(self, a: Self::M, b: Self::M) -> Self::M {
@@ -206,15 +208,24 @@ impl Simd for Avx2 {
         }
     }
     #[inline(always)]
-    fn scale_by_rounded(self, y: Self::F, rounded: Self::F) -> Self::F {
+    fn fraction(self, p: Self::F) -> Self::F {
         // SAFETY: the token proves AVX2 and FMA.
+        unsafe { Pair(_mm256_sub_ps(p.0, _mm256_floor_ps(p.0)), _mm256_sub_ps(p.1, _mm256_floor_ps(p.1))) }
+    }
+    #[inline(always)]
+    fn scale_by_floor(self, m: Self::M, y: Self::F, p: Self::F) -> Self::F {
+        // SAFETY: the token proves AVX2 and FMA. The floor is added to the exponent bits of y ∈ [1, 2].
         unsafe {
-            let scale = |y: __m256, r: __m256| {
-                let exponent = _mm256_slli_epi32::<23>(_mm256_castps_si256(r));
+            let scale = |y: __m256, p: __m256| {
+                let exponent = _mm256_slli_epi32::<23>(_mm256_cvtps_epi32(_mm256_floor_ps(p)));
                 _mm256_castsi256_ps(_mm256_add_epi32(_mm256_castps_si256(y), exponent))
             };
-            Pair(scale(y.0, rounded.0), scale(y.1, rounded.1))
+            Pair(_mm256_and_ps(m.0, scale(y.0, p.0)), _mm256_and_ps(m.1, scale(y.1, p.1)))
         }
+    }
+    #[inline(always)]
+    fn mul_where(self, m: Self::M, a: Self::F, b: Self::F) -> Self::F {
+        self.keep(m, self.mul(a, b))
     }
     #[inline(always)]
     fn reduce_max(self, a: Self::F) -> f32 {

@@ -138,13 +138,14 @@ impl Simd for Avx512 {
         unsafe { _mm512_cmp_ps_mask::<_CMP_GT_OQ>(a, b) }
     }
     #[inline(always)]
-    fn gt_i(self, a: __m512i, b: __m512i) -> __mmask16 {
+    fn gt_where(self, m: __mmask16, a: __m512, b: __m512) -> __mmask16 {
         // SAFETY: the token proves AVX-512.
-        unsafe { _mm512_cmpgt_epi32_mask(a, b) }
+        unsafe { _mm512_mask_cmp_ps_mask::<_CMP_GT_OQ>(m, a, b) }
     }
     #[inline(always)]
-    fn and(self, a: __mmask16, b: __mmask16) -> __mmask16 {
-        a & b
+    fn gt_i_where(self, m: __mmask16, a: __m512i, b: __m512i) -> __mmask16 {
+        // SAFETY: the token proves AVX-512.
+        unsafe { _mm512_mask_cmpgt_epi32_mask(m, a, b) }
     }
     #[inline(always)]
     fn and_not(self, a: __mmask16, b: __mmask16) -> __mmask16 {
@@ -179,12 +180,19 @@ impl Simd for Avx512 {
         unsafe { _mm512_or_ps(a, _mm512_set1_ps(-0.0)) }
     }
     #[inline(always)]
-    fn scale_by_rounded(self, y: __m512, rounded: __m512) -> __m512 {
+    fn fraction(self, p: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512 with DQ. Immediate 1: round down, no fraction bits kept.
+        unsafe { _mm512_reduce_ps::<1>(p) }
+    }
+    #[inline(always)]
+    fn scale_by_floor(self, m: __mmask16, y: __m512, p: __m512) -> __m512 {
         // SAFETY: the token proves AVX-512.
-        unsafe {
-            let exponent = _mm512_slli_epi32::<23>(_mm512_castps_si512(rounded));
-            _mm512_castsi512_ps(_mm512_add_epi32(_mm512_castps_si512(y), exponent))
-        }
+        unsafe { _mm512_maskz_scalef_ps(m, y, p) }
+    }
+    #[inline(always)]
+    fn mul_where(self, m: __mmask16, a: __m512, b: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512.
+        unsafe { _mm512_maskz_mul_ps(m, a, b) }
     }
     #[inline(always)]
     fn reduce_max(self, a: __m512) -> f32 {

@@ -13,6 +13,13 @@ fn map2<A: Copy, B: Copy, C: Copy + Default>(a: [A; LANES], b: [B; LANES], f: im
     std::array::from_fn(|i| f(a[i], b[i]))
 }
 
+/// ⌊p⌋ for |p| < 2³¹ without the library call that `f32::floor` is on a baseline processor.
+#[inline(always)]
+fn floor(p: f32) -> f32 {
+    let truncated = p as i32 as f32;
+    if truncated > p { truncated - 1.0 } else { truncated }
+}
+
 impl Simd for Scalar {
     type F = [f32; LANES];
     type I = [i32; LANES];
@@ -95,12 +102,12 @@ impl Simd for Scalar {
         map2(a, b, |a, b| a > b)
     }
     #[inline(always)]
-    fn gt_i(self, a: Self::I, b: Self::I) -> Self::M {
-        map2(a, b, |a, b| a > b)
+    fn gt_where(self, m: Self::M, a: Self::F, b: Self::F) -> Self::M {
+        std::array::from_fn(|i| m[i] & (a[i] > b[i]))
     }
     #[inline(always)]
-    fn and(self, a: Self::M, b: Self::M) -> Self::M {
-        map2(a, b, |a, b| a & b)
+    fn gt_i_where(self, m: Self::M, a: Self::I, b: Self::I) -> Self::M {
+        std::array::from_fn(|i| m[i] & (a[i] > b[i]))
     }
     #[inline(always)]
     fn and_not(self, a: Self::M, b: Self::M) -> Self::M {
@@ -131,8 +138,20 @@ impl Simd for Scalar {
         a.map(|a| -a.abs())
     }
     #[inline(always)]
-    fn scale_by_rounded(self, y: Self::F, rounded: Self::F) -> Self::F {
-        map2(y, rounded, |y, r| f32::from_bits(y.to_bits().wrapping_add(r.to_bits() << 23)))
+    fn fraction(self, p: Self::F) -> Self::F {
+        p.map(|p| p - floor(p))
+    }
+    #[inline(always)]
+    fn scale_by_floor(self, m: Self::M, y: Self::F, p: Self::F) -> Self::F {
+        // The floor is added to the exponent bits of y ∈ [1, 2].
+        std::array::from_fn(|i| {
+            let exponent = (floor(p[i]) as i32 as u32) << 23;
+            if m[i] { f32::from_bits(y[i].to_bits().wrapping_add(exponent)) } else { 0.0 }
+        })
+    }
+    #[inline(always)]
+    fn mul_where(self, m: Self::M, a: Self::F, b: Self::F) -> Self::F {
+        std::array::from_fn(|i| if m[i] { a[i] * b[i] } else { 0.0 })
     }
     #[inline(always)]
     fn reduce_max(self, a: Self::F) -> f32 {

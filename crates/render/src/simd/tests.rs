@@ -13,7 +13,7 @@ impl Kernel for Exp2 {
     fn run<S: Simd>(self, s: S) -> Vec<f32> {
         let mut out = vec![0.0; self.0.len()];
         for (src, dst) in self.0.as_chunks::<LANES>().0.iter().zip(out.as_chunks_mut::<LANES>().0) {
-            s.store(s.exp2(s.load(src)), dst);
+            s.store(s.exp2_where(s.mask(u16::MAX), s.load(src)), dst);
         }
         out
     }
@@ -25,7 +25,7 @@ impl Kernel for Reductions {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> Self::Output {
         let [a, b, c, d] = self.0.map(|v| s.load(&v));
-        let m = s.and_not(s.gt(a, b), s.ge(c, d));
+        let m = s.and_not(s.gt_where(s.ge(b, d), a, b), s.ge(c, d));
         let (mut kept, mut inverse) = ([0.0; LANES], [0.0; LANES]);
         s.store(s.select(s.mask(s.bits(m)), s.keep(m, s.neg_abs(a)), s.abs(b)), &mut kept);
         s.store(s.recip(s.add(s.abs(a), s.splat(1e-3))), &mut inverse);

@@ -1,6 +1,7 @@
 //! Rows of the parameters and of both moments, added, replaced and widened together.
 
 use super::{Adam, Columns, Group};
+use gazesplat_render::kernels::cpu::cluster::morton_order;
 
 /// Parameters with their optimiser: what densification works on.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +35,28 @@ impl Optimized {
             self.adam.first.data[g].resize(len, 0.0);
             self.adam.second.data[g].resize(len, 0.0);
         }
+    }
+
+    /// Puts row `order[i]` at place i, in parameters and moments.
+    ///
+    /// # Panics
+    /// If `order` names something that is not a row.
+    pub fn reorder(&mut self, order: &[u32]) {
+        for columns in [&mut self.params, &mut self.adam.first, &mut self.adam.second] {
+            for (data, &width) in columns.data.iter_mut().zip(&columns.widths) {
+                let mut moved = Vec::with_capacity(order.len() * width);
+                for &row in order {
+                    moved.extend_from_slice(&data[row as usize * width..][..width]);
+                }
+                *data = moved;
+            }
+        }
+    }
+
+    /// Orders the rows along a Morton curve, so that neighbours in memory are neighbours in space.
+    pub fn sort_spatially(&mut self) {
+        let order = morton_order(self.params.data[Group::Means as usize].as_chunks().0);
+        self.reorder(&order);
     }
 
     /// Overwrites row `target` with row `source`; both lose their moments.

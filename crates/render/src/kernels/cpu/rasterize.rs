@@ -208,7 +208,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
                     stats.num_blended += counters.iter().map(|c| u64::from(c.pixels_blended)).sum::<u64>();
                 }
             } else {
-                write_colors::<DEPTH>(&rows, &tile, width, options, image);
+                write_colors::<S, DEPTH>(s, &rows, &tile, width, options, image);
             }
             if !final_t.is_empty() {
                 for (y, row) in rows[..tile.height].iter().enumerate() {
@@ -244,7 +244,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
     let linear_x = s.mul(s.splat(g.conic.xy), dx);
     let yy = s.splat(g.conic.yy);
     let channels = g.channels.map(|c| s.splat(c));
-    let (cut, floor) = (s.splat(LOG2_ALPHA_MIN), s.splat(LOG2_ALPHA_MIN - 1.0));
+    let cut = s.splat(LOG2_ALPHA_MIN);
     let alpha_max = s.splat(options.alpha_max);
     let t_stop = s.splat(options.t_stop);
     let (zero, position) = (s.splat(0.0), s.splat_i(index));
@@ -254,21 +254,20 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
         let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
         // Compared before the exponential; false for NaN.
         let hit = s.ge(power, cut);
-        // Lanes far outside would be denormal, and every operation on those is a hundred times slower.
-        let mut alpha = s.exp2(s.max(power, floor));
+        let mut alpha = s.exp2_where(hit, power);
         if SMOOTH {
             alpha = smooth_cutoff(s, alpha).0;
         }
         let alpha = s.min(alpha, alpha_max);
         let t = s.load(&row.t.0);
-        let weight = s.mul(alpha, t);
-        let t_next = s.sub(t, weight);
+        let t_next = s.fnma(alpha, t, t);
         // Kerbl 2023, App. C: stop before the splat that would end the pixel.
-        let blended = s.and(hit, s.gt(t_next, t_stop));
-        let weight = s.keep(blended, weight);
+        let blended = s.gt_where(hit, t_next, t_stop);
+        let weight = s.mul_where(blended, alpha, t);
         // No branch: in a dense tile some pixel stops at almost every splat.
-        let now = s.and(s.gt(t, zero), s.and_not(hit, blended));
-        s.store(s.select(now, s.neg_abs(t), s.sub(t, weight)), &mut row.t.0);
+        let now = s.gt_where(s.and_not(hit, blended), t, zero);
+        let t_new = s.select(blended, t_next, t);
+        s.store(s.select(now, s.neg_abs(t), t_new), &mut row.t.0);
         s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
         if STATS == 0 {
             let num = if DEPTH { 4 } else { 3 };
@@ -277,7 +276,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
             }
         } else {
             let best = s.load(&row.best.0);
-            let better = s.and(blended, s.gt(weight, best));
+            let better = s.gt_where(blended, weight, best);
             s.store(s.select(better, weight, best), &mut row.best.0);
             s.store_i(s.select_i(better, position, s.load_i(&row.best_index.0)), &mut row.best_index.0);
             weight_max = s.max(weight_max, weight);
@@ -327,7 +326,8 @@ fn last_stop(rows: &[PixelRow; TILE], tile: &TileRect) -> usize {
 
 /// Writes a tile's pixels: colour over the background, 1 − T, and depth.
 #[inline(always)]
-fn write_colors<const DEPTH: bool>(
+fn write_colors<S: Simd, const DEPTH: bool>(
+    s: S,
     rows: &[PixelRow; TILE],
     tile: &TileRect,
     width: usize,
@@ -335,17 +335,22 @@ fn write_colors<const DEPTH: bool>(
     image: &mut [f32],
 ) {
     let num = if DEPTH { 5 } else { 4 };
+    let background = options.background.map(|b| s.splat(b));
     for (y, row) in rows[..tile.height].iter().enumerate() {
-        let pixels = &mut image[(y * width + tile.x0) * num..][..tile.width * num];
-        for (x, pixel) in pixels.chunks_exact_mut(num).enumerate() {
-            let t = row.t.0[x].abs();
-            for ((value, channel), background) in pixel.iter_mut().zip(&row.channels[..3]).zip(&options.background) {
-                *value = channel.0[x] + t * background;
-            }
-            pixel[3] = 1.0 - t;
-            if DEPTH {
-                pixel[4] = row.channels[3].0[x];
+        let t = s.abs(s.load(&row.t.0));
+        let mut planes = [[0.0; LANES]; 5];
+        for ((plane, channel), b) in planes.iter_mut().zip(&row.channels).zip(background) {
+            s.store(s.fma(t, b, s.load(&channel.0)), plane);
+        }
+        s.store(s.sub(s.splat(1.0), t), &mut planes[3]);
+        planes[4] = row.channels[3].0;
+        let mut pixels = [0.0; LANES * 5];
+        for x in 0..LANES {
+            for (c, plane) in planes[..num].iter().enumerate() {
+                pixels[x * num + c] = plane[x];
             }
         }
+        let len = tile.width * num;
+        image[(y * width + tile.x0) * num..][..len].copy_from_slice(&pixels[..len]);
     }
 }

@@ -172,7 +172,7 @@ fn uncomposite<S: Simd, const DEPTH: bool, const SMOOTH: bool, const ABSOLUTE: b
     let linear_x = s.mul(s.splat(g.conic.xy), dx);
     let yy = s.splat(g.conic.yy);
     let channels = g.channels.map(|c| s.splat(c));
-    let (cut, floor) = (s.splat(LOG2_ALPHA_MIN), s.splat(LOG2_ALPHA_MIN - 1.0));
+    let (cut, position) = (s.splat(LOG2_ALPHA_MIN), s.splat_i(index));
     let alpha_max = s.splat(options.alpha_max);
     let (zero, one) = (s.splat(0.0), s.splat(1.0));
     let guard = s.splat(ONE_MINUS_ALPHA_MIN);
@@ -184,16 +184,17 @@ fn uncomposite<S: Simd, const DEPTH: bool, const SMOOTH: bool, const ABSOLUTE: b
     for (row, center) in rows[first..end].iter_mut().zip(&CENTERS[first..end]) {
         let dy = s.splat(center - g.mean_y);
         let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
-        let hit = s.and(s.ge(power, cut), s.gt_i(s.load_i(&row.stop.0), s.splat_i(index)));
-        let raw = s.exp2(s.max(power, floor));
+        let hit = s.gt_i_where(s.ge(power, cut), s.load_i(&row.stop.0), position);
+        let raw = s.exp2_where(hit, power);
         let (full, slope) = if SMOOTH { smooth_cutoff(s, raw) } else { (raw, one) };
         let alpha = s.min(full, alpha_max);
         // No gradient through a clamped α.
-        let free = s.and(hit, s.gt(alpha_max, full));
-        let alpha = s.keep(hit, alpha);
+        let free = s.gt_where(hit, alpha_max, full);
         let inverse = s.recip(s.max(s.sub(one, alpha), guard));
-        let t = s.mul(s.load(&row.t.0), inverse);
-        s.store(s.select(hit, t, s.load(&row.t.0)), &mut row.t.0);
+        let t_behind = s.load(&row.t.0);
+        let t = s.mul(t_behind, inverse);
+        // Selected, since 1/1 need not come out as exactly 1. All else vanishes with α where nothing is hit.
+        s.store(s.select(hit, t, t_behind), &mut row.t.0);
         let weight = s.mul(alpha, t);
         let mut value = s.mul(channels[0], s.load(&row.upstream[0].0));
         value = s.fma(channels[1], s.load(&row.upstream[1].0), value);
@@ -210,7 +211,7 @@ fn uncomposite<S: Simd, const DEPTH: bool, const SMOOTH: bool, const ABSOLUTE: b
         }
         // ∂α/∂power = α where it is not clamped.
         let d_alpha = if SMOOTH { s.mul(raw, slope) } else { raw };
-        let v_power = s.keep(free, s.mul(v_alpha, d_alpha));
+        let v_power = s.mul_where(free, v_alpha, d_alpha);
         let v_dy = s.mul(v_power, dy);
         m0 = s.add(m0, v_power);
         my = s.add(my, v_dy);

@@ -1,4 +1,5 @@
-//! The only home of lane numbers, tile size and thresholds that kernels share.
+//! The only home of lane numbers, tile size and thresholds that kernels share. Constants of a formula (the dilation,
+//! log2(1/255)) stand with the formula in [`crate::math`].
 
 /// Side of a square tile in pixels: one row of a tile is one vector of sixteen lanes, and 256 pixels of state stay in
 /// the first-level cache (CPU) or in one workgroup (GPU).

@@ -11,7 +11,7 @@ pub struct RenderStats {
     pub num_culled_non_finite: u64,
     /// Gaussians that were skipped with their whole cluster, without being read.
     pub num_culled_by_cluster: u64,
-    /// Gaussians that reach at least one pixel centre's tile.
+    /// Gaussians whose box around the contour α = 1/255 reaches a pixel centre.
     pub num_visible: u64,
     /// (Gaussian, tile) pairs a test of bounding boxes would give.
     pub num_pairs_box: u64,

@@ -19,6 +19,7 @@ use burn::backend::{
     NdArray,
     tensor::{FloatTensor, IntTensor},
 };
+use std::borrow::Cow;
 
 /// Calls `f` with the parameters as slices.
 fn with_slices<B: HostTensors, R>(p: &Parameters<B>, sh_degree: u32, f: impl FnOnce(&GaussianSlices<'_>) -> R) -> R {
@@ -38,9 +39,9 @@ fn with_slices<B: HostTensors, R>(p: &Parameters<B>, sh_degree: u32, f: impl FnO
 
 /// Everything of one frame, as slices.
 pub(crate) struct HostFrame {
-    pub splats: ProjectedSplats,
-    pub lists: TileLists,
-    pub raster: Raster,
+    pub splats: ProjectedSplats<'static>,
+    pub lists: TileLists<'static>,
+    pub raster: Raster<'static>,
     pub stats: RenderStats,
     pub splat_stats: SplatStats,
 }
@@ -81,21 +82,21 @@ fn saved<B: HostTensors>(frame: HostFrame, size: [usize; 2], keep: bool) -> Save
     let HostFrame { splats, lists, raster, .. } = frame;
     let visible = splats.len();
     let size = if keep { size } else { [0, 0] };
-    let kept = |data: Vec<u32>| indices::<B>(if keep { data } else { Vec::new() });
+    let kept = |data: Cow<'static, [u32]>| indices::<B>(if keep { data.into_owned() } else { Vec::new() });
     Saved {
         lanes: if keep {
-            B::f32_tensor(splats.lanes, &[visible, lane::COUNT])
+            B::f32_tensor(splats.lanes.into_owned(), &[visible, lane::COUNT])
         } else {
             B::f32_tensor(Vec::new(), &[0, lane::COUNT])
         },
-        final_t: B::f32_tensor(raster.final_t, &size),
+        final_t: B::f32_tensor(raster.final_t.into_owned(), &size),
         global_from_compact: kept(splats.global_from_compact),
         tile_offsets: kept(lists.tile_offsets),
         pair_splats: kept(lists.pair_splats),
         record_offsets: kept(lists.record_offsets),
         record_pairs: kept(lists.record_pairs),
         tile_ends: kept(raster.tile_ends),
-        stop: B::i32_tensor(raster.stop, &size),
+        stop: B::i32_tensor(raster.stop.into_owned(), &size),
     }
 }
 
@@ -147,24 +148,33 @@ fn backward<B: HostTensors>(
     frame: &Frame,
     with_probe: bool,
 ) -> Backward<B> {
-    let unsigned = |t: &IntTensor<B>| -> Vec<u32> { bytemuck::cast_slice::<i32, u32>(&B::i32_slice(t)).to_vec() };
+    let [ids, offsets, pairs, record_offsets, records, ends] = [
+        &saved.global_from_compact,
+        &saved.tile_offsets,
+        &saved.pair_splats,
+        &saved.record_offsets,
+        &saved.record_pairs,
+        &saved.tile_ends,
+    ]
+    .map(|t| B::i32_slice(t));
+    let unsigned = |slice| Cow::Borrowed(bytemuck::cast_slice::<i32, u32>(slice));
     let splats = ProjectedSplats {
-        lanes: B::f32_slice(&saved.lanes).into_owned(),
-        global_from_compact: unsigned(&saved.global_from_compact),
+        lanes: B::f32_slice(&saved.lanes),
+        global_from_compact: unsigned(&ids),
         ..ProjectedSplats::default()
     };
     let lists = TileLists {
         grid: TileGrid::new(frame.view.width, frame.view.height),
-        tile_offsets: unsigned(&saved.tile_offsets),
-        pair_splats: unsigned(&saved.pair_splats),
-        record_offsets: unsigned(&saved.record_offsets),
-        record_pairs: unsigned(&saved.record_pairs),
+        tile_offsets: unsigned(&offsets),
+        pair_splats: unsigned(&pairs),
+        record_offsets: unsigned(&record_offsets),
+        record_pairs: unsigned(&records),
         num_pairs_box: 0,
     };
     let raster = Raster {
-        final_t: B::f32_slice(&saved.final_t).into_owned(),
-        stop: B::i32_slice(&saved.stop).into_owned(),
-        tile_ends: unsigned(&saved.tile_ends),
+        final_t: B::f32_slice(&saved.final_t),
+        stop: B::i32_slice(&saved.stop),
+        tile_ends: unsigned(&ends),
         ..Raster::default()
     };
     let v_image = B::f32_slice(v_image);

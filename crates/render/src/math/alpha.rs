@@ -44,3 +44,24 @@ pub fn contour_power2(log2_opacity: f32) -> f32 {
 pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + f32::exp(-x))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn log2_form_is_the_gaussian_of_the_paper() {
+        let conic = Sym2 { xx: 0.3, xy: -0.1, yy: 0.2 };
+        for (dx, dy, opacity) in [(0.0f32, 0.0f32, 0.9f32), (1.5, -2.0, 0.5), (-3.0, 4.0, 0.99)] {
+            let power = -0.5 * (conic.xx * dx * dx + 2.0 * conic.xy * dx * dy + conic.yy * dy * dy);
+            let alpha = log2_alpha(log2_conic(conic), opacity.log2(), dx, dy).exp2();
+            assert!((alpha / (opacity * power.exp()) - 1.0).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn the_cut_is_one_step_of_an_8_bit_display() {
+        assert!((LOG2_ALPHA_MIN - crate::layout::ALPHA_MIN.log2()).abs() < 1e-6);
+        assert!((contour_power2(LOG2_ALPHA_MIN)).abs() < 1e-6);
+    }
+}

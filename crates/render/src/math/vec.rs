@@ -74,12 +74,5 @@ pub fn row_times(v: Vec3, m: Mat3) -> Vec3 {
     }
 }
 
-/// m v.
-#[cfg_attr(feature = "gpu", cube)]
-#[inline(always)]
-pub fn times_column(m: Mat3, v: Vec3) -> Vec3 {
-    Vec3 { x: dot(m.row0, v), y: dot(m.row1, v), z: dot(m.row2, v) }
-}
-
 #[cfg(feature = "gpu")]
 super::copy_on_device!(Vec3Expand, Mat3Expand, Mat2x3Expand, Sym2Expand);

@@ -31,7 +31,7 @@ impl Avx2 {
 }
 
 // Every intrinsic below needs only the features that the token proves; measured against the scalar level by
-// `benches/rasterize.rs`. Masks are full-width: all bits of a lane set or clear.
+// `benches/passes.rs`. Masks are full-width: all bits of a lane set or clear.
 impl Simd for Avx2 {
     type F = Pair<__m256>;
     type I = Pair<__m256i>;
@@ -99,11 +99,6 @@ impl Simd for Avx2 {
         unsafe { Pair(_mm256_max_ps(a.0, b.0), _mm256_max_ps(a.1, b.1)) }
     }
     #[inline(always)]
-    fn div(self, a: Self::F, b: Self::F) -> Self::F {
-        // SAFETY: the token proves AVX2 and FMA.
-        unsafe { Pair(_mm256_div_ps(a.0, b.0), _mm256_div_ps(a.1, b.1)) }
-    }
-    #[inline(always)]
     fn fma(self, a: Self::F, b: Self::F, c: Self::F) -> Self::F {
         // SAFETY: the token proves AVX2 and FMA.
         unsafe { Pair(_mm256_fmadd_ps(a.0, b.0, c.0), _mm256_fmadd_ps(a.1, b.1, c.1)) }
@@ -122,9 +117,9 @@ impl Simd for Avx2 {
         }
     }
     #[inline(always)]
-    fn sqrt(self, a: Self::F) -> Self::F {
+    fn div(self, a: Self::F, b: Self::F) -> Self::F {
         // SAFETY: the token proves AVX2 and FMA.
-        unsafe { Pair(_mm256_sqrt_ps(a.0), _mm256_sqrt_ps(a.1)) }
+        unsafe { Pair(_mm256_div_ps(a.0, b.0), _mm256_div_ps(a.1, b.1)) }
     }
     #[inline(always)]
     fn recip(self, a: Self::F) -> Self::F {

@@ -33,7 +33,7 @@ impl Avx512 {
 }
 
 // Every intrinsic below needs only the features that the token proves; measured against the scalar level by
-// `benches/rasterize.rs` (13 to 20 times faster).
+// `benches/passes.rs`.
 impl Simd for Avx512 {
     type F = __m512;
     type I = __m512i;
@@ -108,11 +108,6 @@ impl Simd for Avx512 {
     fn abs(self, a: __m512) -> __m512 {
         // SAFETY: the token proves AVX-512.
         unsafe { _mm512_abs_ps(a) }
-    }
-    #[inline(always)]
-    fn sqrt(self, a: __m512) -> __m512 {
-        // SAFETY: the token proves AVX-512.
-        unsafe { _mm512_sqrt_ps(a) }
     }
     #[inline(always)]
     fn div(self, a: __m512, b: __m512) -> __m512 {

@@ -182,8 +182,6 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn max(self, a: Self::F, b: Self::F) -> Self::F;
     /// |a|.
     fn abs(self, a: Self::F) -> Self::F;
-    /// √a.
-    fn sqrt(self, a: Self::F) -> Self::F;
     /// a / b, correctly rounded.
     fn div(self, a: Self::F, b: Self::F) -> Self::F;
     /// 1 / a for normal a, relative error below 3e-7.

@@ -82,10 +82,6 @@ impl Simd for Scalar {
         a.map(f32::abs)
     }
     #[inline(always)]
-    fn sqrt(self, a: Self::F) -> Self::F {
-        a.map(f32::sqrt)
-    }
-    #[inline(always)]
     fn div(self, a: Self::F, b: Self::F) -> Self::F {
         map2(a, b, |a, b| a / b)
     }

@@ -17,6 +17,7 @@ use crate::math::conic::{Boundary, boundary, row_span};
 use crate::math::vec::Sym2;
 use crate::simd::vectorize;
 use rayon::prelude::*;
+use std::borrow::Cow;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU32, Ordering};
 
@@ -50,19 +51,19 @@ impl TileGrid {
     }
 }
 
-/// Front-to-back lists of all tiles.
+/// Front-to-back lists of all tiles; owned when binned, borrowed when a backward pass reads them again.
 #[derive(Debug, Clone)]
-pub struct TileLists {
+pub struct TileLists<'a> {
     /// The tiles.
     pub grid: TileGrid,
     /// Start of each tile's list in the pair arrays, row-major tiles, `[tiles + 1]`.
-    pub tile_offsets: Vec<u32>,
+    pub tile_offsets: Cow<'a, [u32]>,
     /// Compact index of the splat of each pair, `[P]`.
-    pub pair_splats: Vec<u32>,
+    pub pair_splats: Cow<'a, [u32]>,
     /// First record of each splat, `[V + 1]`.
-    pub record_offsets: Vec<u32>,
+    pub record_offsets: Cow<'a, [u32]>,
     /// Position of each record in the pair arrays, `[P]`: a permutation of 0..P. Empty unless asked for.
-    pub record_pairs: Vec<u32>,
+    pub record_pairs: Cow<'a, [u32]>,
     /// Pairs a test of bounding boxes would give.
     pub num_pairs_box: u64,
 }
@@ -136,7 +137,7 @@ const CHUNK: usize = 1024;
 ///
 /// # Errors
 /// [`Error::Limit`] if there are more pairs than indices.
-pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Result<TileLists> {
+pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Result<TileLists<'static>> {
     let rows = splats.rows();
     // 1. Rows of tiles per splat; one entry each.
     let tile_row_ranges: Vec<Range<u32>> = rows.par_iter().with_min_len(CHUNK).map(|s| tile_rows(s, &grid)).collect();
@@ -154,7 +155,7 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
         true => Err(Error::Limit { what: "(Gaussian, tile) pairs", needed, limit: MAX_PAIRS }),
         false => Ok(()),
     };
-    limit(num_entries)?;
+    limit(num_entries.max(num_pairs_box))?;
     // 2. Tiles of each entry.
     let mut entries = vec![Entry::default(); num_entries as usize];
     let ends = (0..rows.len().div_ceil(CHUNK)).map(|c| entry_offsets[((c + 1) * CHUNK).min(rows.len())]);
@@ -243,8 +244,15 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
             }
         }
     });
-    let record_pairs = record_pairs.into_iter().map(AtomicU32::into_inner).collect();
-    Ok(TileLists { grid, tile_offsets, pair_splats, record_offsets, record_pairs, num_pairs_box })
+    let record_pairs: Vec<u32> = record_pairs.into_iter().map(AtomicU32::into_inner).collect();
+    Ok(TileLists {
+        grid,
+        tile_offsets: tile_offsets.into(),
+        pair_splats: pair_splats.into(),
+        record_offsets: record_offsets.into(),
+        record_pairs: record_pairs.into(),
+        num_pairs_box,
+    })
 }
 
 /// Pairs of each tile of one row: +1 where a span starts, −1 behind its end, summed.

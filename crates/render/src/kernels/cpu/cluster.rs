@@ -2,7 +2,8 @@
 //!
 //! A cluster is [`CLUSTER`] consecutive rows. Its box bounds the means, its radius the largest standard deviation; the
 //! test is conservative, so culling a cluster never changes a pixel. It pays when the rows are spatially sorted
-//! ([`morton_order`]). A cluster with a value that is not finite is never culled here: its rows are counted one by one.
+//! ([`morton_order`]). A cluster with a mean or scale that is not finite is never culled here: its rows are counted one
+//! by one. Other values of culled rows are not read, so not counted.
 
 use super::project::GaussianSlices;
 use crate::layout::CLUSTER;
@@ -43,9 +44,10 @@ pub fn clusters(gaussians: &GaussianSlices<'_>) -> Vec<Cluster> {
                     finite &= m[a].is_finite() && s[a].is_finite();
                 }
             }
-            let center = std::array::from_fn(|a| 0.5 * (low[a] + high[a]));
+            // Every comparison with NaN fails, so nothing excludes such a cluster.
+            let center = std::array::from_fn(|a| if finite { 0.5 * (low[a] + high[a]) } else { f32::NAN });
             let half = std::array::from_fn(|a| 0.5 * (high[a] - low[a]));
-            Cluster { center, half, scale: if finite { widest.exp() } else { f32::INFINITY } }
+            Cluster { center, half, scale: widest.exp() }
         })
         .collect()
 }

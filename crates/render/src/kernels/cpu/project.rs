@@ -15,6 +15,7 @@ use crate::math::sh;
 use crate::math::vec::{Mat2x3, Mat3, Sym2, Vec3};
 use crate::simd::vectorize;
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Parameters of N Gaussians as slices in C order; see [`gazesplat_core::GaussianCloud`] for their meaning.
 #[derive(Debug, Clone, Copy)]
@@ -70,18 +71,18 @@ impl GaussianSlices<'_> {
 
 /// The visible splats of one view, in the order of their Gaussians.
 #[derive(Debug, Clone, Default)]
-pub struct ProjectedSplats {
+pub struct ProjectedSplats<'a> {
     /// `[V, 12]`, lanes as in [`crate::layout::lane`].
-    pub lanes: Vec<f32>,
+    pub lanes: Cow<'a, [f32]>,
     /// Index of the Gaussian behind each splat, ascending, `[V]`.
-    pub global_from_compact: Vec<u32>,
+    pub global_from_compact: Cow<'a, [u32]>,
     /// Gaussians culled for values that are not finite.
     pub num_non_finite: u64,
     /// Gaussians skipped with their cluster.
     pub num_culled_by_cluster: u64,
 }
 
-impl ProjectedSplats {
+impl ProjectedSplats<'_> {
     /// Number of visible splats V.
     pub fn len(&self) -> usize {
         self.global_from_compact.len()
@@ -143,13 +144,13 @@ enum Outcome {
 }
 
 /// Projects all Gaussians; `clusters` are their bounds ([`super::cluster::clusters`]) if the caller keeps any.
-pub fn project(g: &GaussianSlices<'_>, view: &ViewSpec, clusters: Option<&[Cluster]>) -> ProjectedSplats {
+pub fn project(g: &GaussianSlices<'_>, view: &ViewSpec, clusters: Option<&[Cluster]>) -> ProjectedSplats<'static> {
     let frustum = Frustum::new(&view.params, view.width as f32, view.height as f32, view.near);
-    let parts: Vec<ProjectedSplats> = (0..g.len().div_ceil(CLUSTER))
+    let parts: Vec<Part> = (0..g.len().div_ceil(CLUSTER))
         .into_par_iter()
         .map(|chunk| {
             let range = chunk * CLUSTER..((chunk + 1) * CLUSTER).min(g.len());
-            let mut part = ProjectedSplats::default();
+            let mut part = Part::default();
             if clusters.is_some_and(|c| frustum.excludes_cluster(&c[chunk])) {
                 part.num_culled_by_cluster = range.len() as u64;
                 return part;
@@ -175,20 +176,30 @@ pub fn project(g: &GaussianSlices<'_>, view: &ViewSpec, clusters: Option<&[Clust
     concatenate(&parts)
 }
 
+/// The visible splats of one chunk.
+#[derive(Default)]
+struct Part {
+    lanes: Vec<f32>,
+    global_from_compact: Vec<u32>,
+    num_non_finite: u64,
+    num_culled_by_cluster: u64,
+}
+
 /// The parts one after the other.
-fn concatenate(parts: &[ProjectedSplats]) -> ProjectedSplats {
-    let num_visible = parts.iter().map(ProjectedSplats::len).sum();
-    let mut all = ProjectedSplats {
-        lanes: Vec::with_capacity(num_visible * lane::COUNT),
-        global_from_compact: Vec::with_capacity(num_visible),
+fn concatenate(parts: &[Part]) -> ProjectedSplats<'static> {
+    let num_visible = parts.iter().map(|p| p.global_from_compact.len()).sum();
+    let mut lanes = Vec::with_capacity(num_visible * lane::COUNT);
+    let mut global_from_compact = Vec::with_capacity(num_visible);
+    for part in parts {
+        lanes.extend_from_slice(&part.lanes);
+        global_from_compact.extend_from_slice(&part.global_from_compact);
+    }
+    ProjectedSplats {
+        lanes: lanes.into(),
+        global_from_compact: global_from_compact.into(),
         num_non_finite: parts.iter().map(|p| p.num_non_finite).sum(),
         num_culled_by_cluster: parts.iter().map(|p| p.num_culled_by_cluster).sum(),
-    };
-    for part in parts {
-        all.lanes.extend_from_slice(&part.lanes);
-        all.global_from_compact.extend_from_slice(&part.global_from_compact);
     }
-    all
 }
 
 /// Projection of Gaussian `i`.

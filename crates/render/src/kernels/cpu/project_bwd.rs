@@ -51,8 +51,8 @@ struct RowGradient {
 pub fn project_bwd(
     g: &GaussianSlices<'_>,
     view: &ViewSpec,
-    splats: &ProjectedSplats,
-    lists: &TileLists,
+    splats: &ProjectedSplats<'_>,
+    lists: &TileLists<'_>,
     pair_gradients: &[Record],
     probe: bool,
 ) -> ParameterGradients {
@@ -127,7 +127,7 @@ const PREFETCH_AHEAD: usize = 24;
 
 /// Sum over a splat's pairs, in the order of its records.
 #[inline(always)]
-fn sum_records(lists: &TileLists, pair_gradients: &[Record], compact: usize) -> Record {
+fn sum_records(lists: &TileLists<'_>, pair_gradients: &[Record], compact: usize) -> Record {
     let records = lists.record_offsets[compact] as usize..lists.record_offsets[compact + 1] as usize;
     let mut sum = [0.0; grad_lane::COUNT];
     for r in records {

@@ -13,6 +13,7 @@ use crate::math::alpha::LOG2_ALPHA_MIN;
 use crate::simd::{Kernel, LANES, Simd, dispatch};
 use crate::stats::RenderStats;
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// Options of the rasterisers.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -38,15 +39,15 @@ impl RasterOptions {
 
 /// What a frame leaves behind.
 #[derive(Debug, Clone, Default)]
-pub struct Raster {
+pub struct Raster<'a> {
     /// `[H, W, 4 or 5]`: RGB over the background, α = 1 − T, and Σ T α z if asked for. Empty for a statistics pass.
     pub image: Vec<f32>,
     /// Transmittance left at each pixel, `[H, W]`.
-    pub final_t: Vec<f32>,
+    pub final_t: Cow<'a, [f32]>,
     /// List position at which each pixel stopped, `[H, W]`; `i32::MAX` = never.
-    pub stop: Vec<i32>,
+    pub stop: Cow<'a, [i32]>,
     /// List position at which each tile ended, `[tiles]`: entries before it were worked through.
-    pub tile_ends: Vec<u32>,
+    pub tile_ends: Cow<'a, [u32]>,
     /// Counters of each pair, in list order, `[P]`; empty unless asked for.
     pub pair_stats: Vec<PairStats>,
     /// Per-tile counters, summed.
@@ -78,30 +79,27 @@ const FRESH: PixelRow = PixelRow {
 /// Composites all tiles. `splats`: lanes `[V]`; `keep` keeps what the backward pass needs.
 pub fn rasterize(
     splats: &[[f32; lane::COUNT]],
-    lists: &TileLists,
+    lists: &TileLists<'_>,
     options: &RasterOptions,
     level: StatsLevel,
     keep: bool,
-) -> Raster {
+) -> Raster<'static> {
     let (width, height) = (lists.grid.width as usize, lists.grid.height as usize);
     let channels = if level == StatsLevel::None { options.num_channels() } else { 0 };
-    let mut raster = Raster {
-        image: vec![0.0; width * height * channels],
-        final_t: vec![0.0; if keep { width * height } else { 0 }],
-        stop: vec![0; if keep { width * height } else { 0 }],
-        tile_ends: vec![0; lists.grid.len()],
-        ..Raster::default()
-    };
+    let num_kept = if keep { width * height } else { 0 };
+    let mut image = vec![0.0; width * height * channels];
+    let (mut final_t, mut stop) = (vec![0.0; num_kept], vec![0; num_kept]);
+    let mut tile_ends = vec![0; lists.grid.len()];
     let splats = &raster_splats(splats);
     let mut tile_stats = vec![Vec::new(); lists.grid.tiles_y as usize];
     // A missing plane is cut into empty strips, so that all planes zip.
     let strip = |plane: usize| TILE * width * plane;
     let strips = (0..lists.grid.tiles_y as usize)
         .into_par_iter()
-        .zip(strips_of(&mut raster.image, strip(channels), lists))
-        .zip(strips_of(&mut raster.final_t, strip(usize::from(keep)), lists))
-        .zip(strips_of(&mut raster.stop, strip(usize::from(keep)), lists))
-        .zip(raster.tile_ends.par_chunks_mut(lists.grid.tiles_x as usize))
+        .zip(strips_of(&mut image, strip(channels), lists))
+        .zip(strips_of(&mut final_t, strip(usize::from(keep)), lists))
+        .zip(strips_of(&mut stop, strip(usize::from(keep)), lists))
+        .zip(tile_ends.par_chunks_mut(lists.grid.tiles_x as usize))
         .zip(tile_stats.par_iter_mut())
         .map(|(((((tile_y, image), final_t), stop), tile_ends), pair_stats)| {
             let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats };
@@ -115,18 +113,25 @@ pub fn rasterize(
             }
         })
         .collect::<Vec<RenderStats>>();
-    for s in &strips {
-        raster.stats.add_tiles(s);
+    let mut stats = RenderStats::default();
+    for strip in &strips {
+        stats.add_tiles(strip);
     }
-    raster.pair_stats = tile_stats.into_iter().flatten().collect();
-    raster
+    Raster {
+        image,
+        final_t: final_t.into(),
+        stop: stop.into(),
+        tile_ends: tile_ends.into(),
+        pair_stats: tile_stats.into_iter().flatten().collect(),
+        stats,
+    }
 }
 
 /// `plane` cut into one strip per row of tiles; empty strips if there is no plane.
 pub(super) fn strips_of<'a, T: Send>(
     plane: &'a mut [T],
     strip: usize,
-    lists: &TileLists,
+    lists: &TileLists<'_>,
 ) -> rayon::vec::IntoIter<&'a mut [T]> {
     let len = plane.len();
     let ends = (1..=lists.grid.tiles_y as usize).map(|row| (row * strip).min(len));
@@ -136,7 +141,7 @@ pub(super) fn strips_of<'a, T: Send>(
 /// One row of tiles and the parts of the output it owns.
 struct Strip<'a> {
     splats: &'a [RasterSplat],
-    lists: &'a TileLists,
+    lists: &'a TileLists<'a>,
     options: &'a RasterOptions,
     tile_y: usize,
     image: &'a mut [f32],

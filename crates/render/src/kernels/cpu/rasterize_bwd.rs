@@ -46,9 +46,9 @@ const EMPTY: PixelRow = PixelRow {
 /// of per-pixel magnitudes (Ye 2024).
 pub fn rasterize_bwd(
     splats: &[[f32; lane::COUNT]],
-    lists: &TileLists,
+    lists: &TileLists<'_>,
     options: &RasterOptions,
-    raster: &Raster,
+    raster: &Raster<'_>,
     v_image: &[f32],
     absolute: bool,
 ) -> Vec<Record> {
@@ -75,9 +75,9 @@ pub fn rasterize_bwd(
 /// One row of tiles and its records.
 struct Strip<'a> {
     splats: &'a [RasterSplat],
-    lists: &'a TileLists,
+    lists: &'a TileLists<'a>,
     options: &'a RasterOptions,
-    raster: &'a Raster,
+    raster: &'a Raster<'a>,
     v_image: &'a [f32],
     tile_y: usize,
     records: &'a mut [Record],
@@ -127,7 +127,7 @@ fn load_tile<const DEPTH: bool>(
     tile: &TileRect,
     width: usize,
     options: &RasterOptions,
-    raster: &Raster,
+    raster: &Raster<'_>,
     v_image: &[f32],
 ) -> bool {
     let num = if DEPTH { 5 } else { 4 };

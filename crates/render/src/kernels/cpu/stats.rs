@@ -71,9 +71,9 @@ pub(super) fn credit_winners<'a>(counters: &mut [PairStats], winners: impl Itera
 pub fn splat_stats(
     mode: StatsMode,
     num_splats: usize,
-    splats: &ProjectedSplats,
-    lists: &TileLists,
-    raster: &Raster,
+    splats: &ProjectedSplats<'_>,
+    lists: &TileLists<'_>,
+    raster: &Raster<'_>,
 ) -> SplatStats {
     let rows = |wanted: StatsMode| if mode >= wanted { num_splats } else { 0 };
     let mut out = SplatStats {
@@ -85,7 +85,7 @@ pub fn splat_stats(
         tiles_blended: vec![0; rows(StatsMode::All)],
     };
     if mode >= StatsMode::Tiles {
-        for (&start, &end) in lists.tile_offsets.iter().zip(&raster.tile_ends) {
+        for (&start, &end) in lists.tile_offsets.iter().zip(raster.tile_ends.iter()) {
             for &splat in &lists.pair_splats[start as usize..][..end as usize] {
                 out.tiles_used[splats.global_from_compact[splat as usize] as usize] += 1;
             }

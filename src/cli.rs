@@ -83,6 +83,7 @@ pub fn run() -> Result<()> {
     let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.exit());
     start_log(cli.verbosity);
     let console = Console::new(cli.verbosity.quiet);
+    let console = if cli.verbosity.verbose > 0 { console.without_bars() } else { console };
     match cli.command {
         Command::Train(args) => train::command(&args, &console),
         Command::Eval(args) => eval::command(&args, &console),

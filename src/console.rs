@@ -20,6 +20,12 @@ impl Console {
         Self { quiet, live, bars: MultiProgress::new() }
     }
 
+    /// Plain lines instead of bars: a log on the same terminal would break them.
+    #[must_use]
+    pub fn without_bars(self) -> Self {
+        Self { live: false, ..self }
+    }
+
     /// Nothing but warnings: for use as a library.
     pub fn quiet() -> Self {
         Self::new(true)
@@ -28,11 +34,6 @@ impl Console {
     /// True when progress may redraw its line; otherwise it is told in plain lines.
     pub fn is_live(&self) -> bool {
         self.live
-    }
-
-    /// True when only warnings and errors are told.
-    pub fn is_quiet(&self) -> bool {
-        self.quiet
     }
 
     /// The bars that share the terminal with the notes.

@@ -178,19 +178,34 @@ impl Diagnostic for Inner {
 
 impl From<gazesplat_core::Error> for Failure {
     fn from(error: gazesplat_core::Error) -> Self {
-        Self::new(error.to_string()).hint_if(error.hint())
+        let hint = match &error {
+            gazesplat_core::Error::Parameter { .. } => Some("`gazesplat COMMAND --help` says what each option takes"),
+            other => other.hint(),
+        };
+        Self::new(error.to_string()).hint_if(hint)
     }
 }
 
 impl From<gazesplat_render::Error> for Failure {
     fn from(error: gazesplat_render::Error) -> Self {
-        Self::new(error.to_string())
+        let hint = match &error {
+            gazesplat_render::Error::Parameter { expected, .. } => {
+                Some(format!("give {expected}; `gazesplat render --help` has the default"))
+            }
+            gazesplat_render::Error::Limit { .. } => Some("draw a smaller image or a smaller model".to_owned()),
+            gazesplat_render::Error::Shape { .. } => None,
+        };
+        Self::new(error.to_string()).hint_if(hint)
     }
 }
 
 impl From<gazesplat_train::Error> for Failure {
     fn from(error: gazesplat_train::Error) -> Self {
-        Self::new(error.to_string()).hint_if(error.hint())
+        match error {
+            gazesplat_train::Error::Scene(error) => error.into(),
+            gazesplat_train::Error::Render(error) => error.into(),
+            other => Self::new(other.to_string()).hint_if(other.hint()),
+        }
     }
 }
 

@@ -7,6 +7,7 @@
 //! | `point_cloud.ply` | the model, 3DGS layout |
 //! | `eval.json` | test-view quality |
 //! | `report.html` | all of it to look at |
+//! | `unfinished.ply` | only of a training that failed: its last good model |
 
 use crate::diagnostics::{Failure, Result};
 use crate::settings;
@@ -98,9 +99,30 @@ impl RunDir {
         self.path.join("eval.json")
     }
 
+    /// `unfinished.ply`: the last good model of a training that failed.
+    pub fn unfinished_path(&self) -> PathBuf {
+        self.path.join("unfinished.ply")
+    }
+
     /// `report.html`.
     pub fn report_path(&self) -> PathBuf {
         self.path.join("report.html")
+    }
+
+    /// Removes the files of the run that was here, so that none of them stands beside those of the next.
+    ///
+    /// # Errors
+    /// When a file cannot be removed.
+    pub fn clear(&self) -> Result<()> {
+        let unfinished = self.unfinished_path();
+        let files = [self.model_path(), self.eval_path(), self.report_path(), self.metrics_path(), unfinished];
+        for file in files.into_iter().chain([self.settings_path()]) {
+            match fs::remove_file(&file) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(cannot_write(&file, e)),
+                _ => {}
+            }
+        }
+        Ok(())
     }
 
     /// Writes `settings.toml`: the resolved settings under a line that says where they come from.
@@ -226,7 +248,10 @@ mod tests {
         fs::write(root.path().join(MODEL), b"ply").expect("writable");
         let failure = RunDir::create(root.path(), false).expect_err("must be refused");
         assert!(failure.report(false).contains("--overwrite"));
-        RunDir::create(root.path(), true).expect("asked for");
-        assert!(root.path().join(MODEL).exists(), "the old model stays until the new one is there");
+        let run_dir = RunDir::create(root.path(), true).expect("asked for");
+        assert!(root.path().join(MODEL).exists(), "the old run stays until the next has passed its checks");
+        fs::write(root.path().join("mine.txt"), b"notes").expect("writable");
+        run_dir.clear().expect("writable");
+        assert!(!root.path().join(MODEL).exists() && root.path().join("mine.txt").exists());
     }
 }

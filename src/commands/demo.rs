@@ -8,12 +8,14 @@ use crate::diagnostics::{Failure, Result};
 use crate::interrupt;
 use crate::progress;
 use crate::report::{html, pictures};
+use crate::run_dir::cannot_write;
 use crate::settings::Settings;
 use clap::Args;
 use gazesplat_core::RgbImage8;
 use gazesplat_core::camera::path::CameraPath;
 use gazesplat_core::synthetic::SynthOptions;
 use gazesplat_render::{Splats, cpu_device};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -42,7 +44,7 @@ pub struct DemoArgs {
     /// A small scene and few steps: shows that everything works, not how good it gets
     #[arg(long)]
     pub quick: bool,
-    /// Replace a run that is in the directory given with --out
+    /// Replace the run and the `scene` that are in the directory given with --out
     #[arg(long)]
     pub overwrite: bool,
 }
@@ -55,13 +57,10 @@ pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
     let started = Instant::now();
     let stop = interrupt::stop_flag()?;
     let overwrite = args.overwrite || args.out == Path::new(DEFAULT_OUT);
-    if !overwrite && args.out.join("point_cloud.ply").exists() {
-        return Err(Failure::new(format!("`{}` already holds a run", args.out.display()))
-            .hint("choose another directory with `--out`, or replace the run with `--overwrite`"));
-    }
+    let scene = args.out.join("scene");
+    make_way(&args.out, &scene, overwrite)?;
     let size = if args.quick { Size::QUICK } else { Size::FULL };
 
-    let scene = args.out.join("scene");
     console.note("1/3  a procedural room");
     let synth_started = Instant::now();
     synth::write(&scene, &size.scene, console)?;
@@ -70,7 +69,6 @@ pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
     console.note(format_args!("2/3  training, {} steps", grouped(size.num_steps as usize)));
     let config = Settings::new()
         .with_override(&format!("train.steps={}", size.num_steps))?
-        .with_override(&format!("train.eval_every={}", (size.num_steps / 6).max(1)))?
         .with_override(&format!("densify.cap={}", size.cap))?
         .resolve()?;
     let job = TrainJob { scene: &scene, config, out: Some(&args.out), overwrite };
@@ -83,9 +81,15 @@ pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
 
     let report = &mut trained.report;
     report.title = "A room that was never built".to_owned();
+    let num_steps = if trained.num_steps == size.num_steps {
+        size.num_steps.to_string()
+    } else {
+        format!("{} of {}", trained.num_steps, size.num_steps)
+    };
     report.subtitle = format!(
-        "{} photographs of a procedural room went in, this 3D Gaussian model came out after {} steps on the processor.",
-        size.scene.num_views, size.num_steps
+        "{} photographs of a procedural room went in, this 3D Gaussian model came out after {num_steps} steps on the \
+         processor.",
+        size.scene.num_views
     );
     report.film = film;
     report.durations.insert(0, ("making the scene".to_owned(), synth_secs));
@@ -103,12 +107,31 @@ pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
         console.note(format_args!("{what:7} {place}"));
     }
     console.note(format_args!(
-        "done: {:.2} dB PSNR on {} test views, {} Gaussians, {} in all",
+        "done: {:.2} dB PSNR on {} {} views, {} Gaussians, {} in all",
         trained.eval.psnr,
         trained.eval.views.len(),
+        trained.report.measured.name(),
         grouped(trained.cloud.len()),
         duration(started.elapsed().as_secs_f64())
     ));
+    Ok(())
+}
+
+/// Refuses to touch what is in `out` unless it may be replaced; then the old scene goes, whose images may be others.
+fn make_way(out: &Path, scene: &Path, overwrite: bool) -> Result<()> {
+    if out.is_file() {
+        return Err(Failure::new(format!("`{}` is a file, expected a directory", out.display()))
+            .hint("choose another directory with `--out`"));
+    }
+    let is_occupied = scene.symlink_metadata().is_ok();
+    if !overwrite && (is_occupied || out.join("point_cloud.ply").exists()) {
+        let what = if is_occupied { "a scene" } else { "a run" };
+        return Err(Failure::new(format!("`{}` already holds {what}", out.display()))
+            .hint("choose another directory with `--out`, or replace what is there with `--overwrite`"));
+    }
+    if scene.is_dir() {
+        fs::remove_dir_all(scene).map_err(|e| cannot_write(scene, e))?;
+    }
     Ok(())
 }
 

@@ -1,13 +1,14 @@
 //! `gazesplat eval`: how close a model comes to the photographs of a scene.
 
-use super::{Model, Split, load_scene, on_threads, quality};
+use super::{Model, Split, load_scene, log_machine, quality};
 use crate::cli::SettingsArgs;
-use crate::console::{Console, grouped};
+use crate::console::{Console, bytes, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::run_dir;
 use clap::Args;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_render::{Splats, cpu_device};
+use gazesplat_train::with_threads;
 use std::path::PathBuf;
 
 /// Arguments of `eval`.
@@ -19,7 +20,10 @@ Examples:
   gazesplat eval runs/fox-1 --scene fox --min-psnr 25 || echo worse than 25 dB
 
 A run is measured with the settings it was trained with (image size, split, background), a PLY
-file with the defaults.")]
+file with the defaults.
+
+Gaussians with a value that is not finite are left out, with a warning that names the file and
+their number; a model without any other is refused.")]
 pub struct EvalArgs {
     /// A 3DGS PLY file, or the directory of a run
     pub model: PathBuf,
@@ -45,14 +49,16 @@ pub struct EvalArgs {
 /// # Errors
 /// When the model or the scene cannot be read, or the quality is below `--min-psnr`.
 pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
-    let model = Model::load(&args.model, console)?;
+    let model = Model::load_for_drawing(&args.model, console)?;
     let config = model.settings(&args.settings)?;
     let dataset = load_scene(&args.scene, &config, console)?;
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
-    let report = on_threads(config.train.threads, || {
+    let report = with_threads(config.train.threads, || {
+        log_machine();
         let splats = Splats::from_cloud(&model.cloud, &cpu_device());
         quality::measure(&splats, &images, &config.render_options(), console)
-    })?;
+    })??;
+    tracing::info!("images in memory: {} of {}", bytes(images.num_bytes() as u64), images.len());
     if let Some(out) = &args.out {
         run_dir::write_text(out, &format!("{}\n", run_dir::to_json(&report)))?;
     }

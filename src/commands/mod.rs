@@ -19,6 +19,7 @@ use crate::settings::Settings;
 use gazesplat_core::dataset::LoadOptions;
 use gazesplat_core::io::ply;
 use gazesplat_core::{Dataset, GaussianCloud, View};
+use gazesplat_render::kernels::cpu::cluster::morton_order;
 use gazesplat_train::Config;
 use std::path::{Path, PathBuf};
 
@@ -45,9 +46,14 @@ impl Split {
             Self::All => dataset.all_views().into_iter().cloned().collect(),
         };
         if views.is_empty() {
-            let name = if self == Self::Train { "train" } else { "test" };
-            return Err(Failure::new(format!("`{}` has no {name} views", scene.display()))
-                .hint("`--split all` takes every view; `--set data.test_every=8` keeps every 8th view for testing"));
+            let (name, hint) = match self {
+                Self::Train => ("training views", "`--split all` takes every view"),
+                Self::Test => {
+                    ("test views", "`--split all` takes every view; `data.test_every = 8` keeps every 8th for testing")
+                }
+                Self::All => ("views", "check that the scene lists images with cameras: `gazesplat info SCENE`"),
+            };
+            return Err(Failure::new(format!("`{}` has no {name}", scene.display())).hint(hint));
         }
         Ok(views)
     }
@@ -71,7 +77,7 @@ pub fn load_scene(scene: &Path, config: &Config, console: &Console) -> Result<Da
     Ok(dataset)
 }
 
-/// Name of the scene in directory `scene`: `../shared/fox/` is `fox`.
+/// Name of the scene in directory `scene`: `captures/fox/` is `fox`.
 pub fn scene_name(scene: &Path) -> String {
     let absolute = std::path::absolute(scene).unwrap_or_else(|_| scene.to_owned());
     let mut normal = absolute.components().filter_map(|c| match c {
@@ -120,6 +126,32 @@ impl Model {
         Ok(Self { cloud, path: file, run })
     }
 
+    /// Reads a model as [`Model::load`] does and prepares it for drawing: neighbours in space become neighbours in
+    /// memory, so that whole clusters of them can be passed over, and SH bands that are 0 throughout are cut off.
+    ///
+    /// # Errors
+    /// As [`Model::load`]; when there is no Gaussian to draw.
+    pub fn load_for_drawing(path: &Path, console: &Console) -> Result<Self> {
+        let mut model = Self::load(path, console)?;
+        if model.cloud.is_empty() {
+            return Err(Failure::new(format!("`{}` holds no Gaussian that can be drawn", model.path.display()))
+                .hint("the model is empty or all its values are broken: export or train it again"));
+        }
+        let order: Vec<usize> = morton_order(&model.cloud.means).into_iter().map(|row| row as usize).collect();
+        model.cloud = model.cloud.select(&order);
+        let degree = model.cloud.highest_nonzero_degree();
+        tracing::info!(
+            "`{}`: {} Gaussians, SH degree {}, {degree} in use",
+            model.path.display(),
+            grouped(model.cloud.len()),
+            model.cloud.sh_degree
+        );
+        if degree < model.cloud.sh_degree {
+            model.cloud = model.cloud.with_sh_degree(degree);
+        }
+        Ok(model)
+    }
+
     /// Settings for working with this model: those of its run, if it was given as one, under those of the command line.
     ///
     /// # Errors
@@ -143,10 +175,13 @@ pub(crate) fn layered(settings: Settings, args: &SettingsArgs) -> Result<Setting
     settings.with_overrides(&args.overrides)
 }
 
-/// Runs `work` on `num_threads` threads, 0 for all cores.
-pub(crate) fn on_threads<T: Send>(num_threads: usize, work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(num_threads).build();
-    pool.map_err(|e| Failure::new(format!("cannot start {num_threads} threads: {e}")))?.install(work)
+/// Tells what the machine works with, at `-v`.
+pub(crate) fn log_machine() {
+    tracing::info!(
+        "{} threads, vector instructions {:?}",
+        rayon::current_num_threads(),
+        gazesplat_render::simd::level()
+    );
 }
 
 #[cfg(test)]
@@ -155,7 +190,7 @@ mod tests {
 
     #[test]
     fn scene_is_named_by_its_directory() {
-        assert_eq!(scene_name(Path::new("../shared/fox/")), "fox");
+        assert_eq!(scene_name(Path::new("captures/fox/")), "fox");
         assert_eq!(scene_name(Path::new("/")), "scene");
     }
 }

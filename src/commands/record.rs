@@ -93,6 +93,16 @@ impl Recorder {
         for ((_, ms), sum) in STAGES.iter().zip(&mut self.stage_sum_ms) {
             *sum += f64::from(ms(&report.stage_ms));
         }
+        let is_logged = report.is_logged(self.log_every);
+        if is_logged {
+            let stages = || STAGES.iter().map(|(name, ms)| format!("{name} {:.2}", ms(&report.stage_ms)));
+            tracing::debug!(
+                "step {} on `{}`, ms: {}",
+                report.step,
+                report.view,
+                stages().collect::<Vec<_>>().join(", ")
+            );
+        }
         self.pending = Some(Record {
             step: report.step,
             loss: report.loss,
@@ -102,7 +112,7 @@ impl Recorder {
             num_gaussians: report.num_gaussians,
             step_ms: report.stage_ms,
             test: None,
-            is_logged: report.is_logged(self.log_every),
+            is_logged,
         });
         Ok(())
     }
@@ -136,6 +146,13 @@ impl Observer for Recorder {
         match event {
             TrainEvent::Step(report) => self.step(report)?,
             TrainEvent::Evaluated { report, step } => self.evaluated(report, *step),
+            TrainEvent::Densified { step, report } => tracing::info!(
+                "step {step}: {} added, {} relocated, {} of them broken, {} Gaussians",
+                report.num_added,
+                report.num_relocated + report.num_relocated_broken,
+                report.num_relocated_broken,
+                report.num_gaussians
+            ),
             TrainEvent::Finished { .. } => self.flush()?,
             _ => {}
         }

@@ -1,7 +1,7 @@
 //! `gazesplat render`: a model seen from the cameras of a scene or along a path, as PNG files or a video.
 
 use super::frames::{self, NamedCamera};
-use super::{Model, Split, load_scene};
+use super::{Model, Split, load_scene, log_machine};
 use crate::cli::{SettingsArgs, Size, parse_fov_deg, parse_rgb, parse_size};
 use crate::console::{Console, duration};
 use crate::diagnostics::{Failure, Result};
@@ -27,7 +27,10 @@ Examples:
   gazesplat render model.ply --path orbit.json --size 1280x720 --out orbit.y4m
   ffmpeg -i orbit.y4m -crf 16 orbit.mp4
 
-A .y4m video is raw: YUV 4:4:4, 8 bit, BT.709, limited range. Players and encoders read it as it is."
+A .y4m video is raw: YUV 4:4:4, 8 bit, BT.709, limited range. Players and encoders read it as it is.
+
+Gaussians with a value that is not finite are left out, with a warning that names the file and
+their number; a model without any other is refused."
 )]
 pub struct RenderArgs {
     /// A 3DGS PLY file, or the directory of a run
@@ -70,7 +73,8 @@ pub struct RenderArgs {
 /// When the model, the cameras or an option is wrong, or the frames cannot be written.
 pub fn command(args: &RenderArgs, console: &Console) -> Result<()> {
     let target = Target::new(args)?;
-    let model = Model::load(&args.model, console)?;
+    log_machine();
+    let model = Model::load_for_drawing(&args.model, console)?;
     let mut config = model.settings(&SettingsArgs::default())?;
     // Training may have looked at smaller images; frames have the scene's own size.
     config.data.max_side = 0;

@@ -77,7 +77,12 @@ pub fn command(args: &SynthArgs, console: &Console) -> Result<()> {
 /// Writes the scene into `dir` and tells about it.
 pub(crate) fn write(dir: &Path, options: &SynthOptions, console: &Console) -> Result<Dataset> {
     let started = Instant::now();
-    let dataset = synthetic::write_scene(dir, options)?;
+    let dataset = synthetic::write_scene(dir, options).map_err(|error| match &error {
+        gazesplat_core::Error::Io { .. } => {
+            Failure::from(error).hint("choose a place that can be written with `--out`")
+        }
+        _ => error.into(),
+    })?;
     console.note(format_args!(
         "{}: {} views of {}x{}, {} points, {}",
         dir.display(),

@@ -1,20 +1,20 @@
 //! `gazesplat train`: photographs in, a model with its measured quality out.
 
 use super::record::Recorder;
-use super::{layered, load_scene, on_threads, quality, scene_name};
+use super::{layered, load_scene, log_machine, quality, scene_name};
 use crate::cli::SettingsArgs;
 use crate::console::{Console, bytes, duration, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::interrupt;
 use crate::progress::{self, TrainProgress};
-use crate::report::{Figure, Report, html};
+use crate::report::{Figure, Measured, Report, html};
 use crate::run_dir::RunDir;
 use crate::settings::{self, Settings};
 use clap::{Args, ValueEnum};
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Dataset, GaussianCloud};
 use gazesplat_render::{Splats, cpu_device};
-use gazesplat_train::{Config, EvalReport, Outcome, Trainer};
+use gazesplat_train::{Config, EvalReport, Outcome, Trainer, with_threads};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -94,6 +94,8 @@ pub struct Trained {
     pub dataset: Dataset,
     /// The model.
     pub cloud: GaussianCloud,
+    /// Steps done: fewer than the settings say when the training was stopped.
+    pub num_steps: u32,
     /// Its quality, as in `eval.json`.
     pub eval: EvalReport,
     /// What `report.html` was made of.
@@ -106,11 +108,20 @@ pub struct Trained {
 /// # Errors
 /// When the scene or the directory cannot be used, an image does not decode, or the loss is no longer finite.
 pub fn train(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result<Trained> {
-    on_threads(job.config.train.threads, || train_here(job, stop, console))
+    with_threads(job.config.train.threads, || train_here(job, stop, console))?
 }
 
 fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result<Trained> {
     let config = &job.config;
+    log_machine();
+    tracing::info!(
+        "settings: {} steps, seed {}, at most {} Gaussians, SH degree {}",
+        config.train.steps,
+        config.train.seed,
+        config.densify.cap,
+        config.model.sh_degree
+    );
+    tracing::debug!("all settings:\n{}", settings::to_toml(config));
     let mut durations = Vec::new();
     let started = Instant::now();
     let dataset = load_scene(job.scene, config, console)?;
@@ -129,20 +140,31 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
     preload(&images, console)?;
-    let mut trainer = Trainer::new(&dataset, Arc::clone(&images), config, &cpu_device().autodiff())?;
+    let mut trainer = Trainer::new(&dataset, Arc::clone(&images), config, &cpu_device())?;
     warnings.extend_from_slice(trainer.messages());
     let (measured, measured_images) = match dataset.test.is_empty() {
-        false => ("test", Arc::clone(trainer.test_images())),
-        true => ("training", images),
+        false => (Measured::Test, Arc::clone(trainer.test_images())),
+        true => (Measured::Training, Arc::clone(&images)),
     };
-    if measured == "training" {
+    if measured == Measured::Training {
         let text = "no view is kept for testing: quality is measured on the training views".to_owned();
         console.warn(&text);
         warnings.push(text);
     }
     preload(&measured_images, console)?;
+    tracing::info!(
+        "images in memory: {} training ({}), {} measured ({}), at most {} each",
+        images.len(),
+        bytes(images.num_bytes() as u64),
+        measured_images.len(),
+        bytes(measured_images.num_bytes() as u64),
+        bytes(config.data.cache_bytes as u64)
+    );
     durations.push(("reading the scene".to_owned(), started.elapsed().as_secs_f64()));
 
+    if job.overwrite {
+        run_dir.clear()?;
+    }
     run_dir.write_settings(config, job.scene)?;
     let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every);
     let mut bar = TrainProgress::new(console, config.train.steps);
@@ -179,11 +201,17 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     if test_psnr.last().is_none_or(|last| last.0 != num_steps) {
         test_psnr.push((num_steps, eval.psnr));
     }
+    let measured_name = measured.name();
     let report = Report {
+        measured,
         title: scene_name(job.scene),
         subtitle: format!("A 3D Gaussian model, trained in {num_steps} steps on {} photographs.", dataset.train.len()),
         headline: vec![
-            Figure::new(format!("{:.2}", eval.psnr), "dB", &format!("PSNR on {} {measured} views", eval.views.len())),
+            Figure::new(
+                format!("{:.2}", eval.psnr),
+                "dB",
+                &format!("PSNR on {} {measured_name} views", eval.views.len()),
+            ),
             Figure::new(format!("{:.3}", eval.ssim), "", "SSIM"),
             Figure::new(grouped(eval.num_gaussians), "", "Gaussians"),
             Figure::new(duration(train_secs), "", "training time"),
@@ -201,7 +229,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     };
     run_dir.write_report(&html::page(&report))?;
     console.note(format_args!(
-        "{}: {:.2} dB PSNR, {:.3} SSIM on {} {measured} views, {} Gaussians, {}",
+        "{}: {:.2} dB PSNR, {:.3} SSIM on {} {measured_name} views, {} Gaussians, {}",
         run_dir.path().display(),
         eval.psnr,
         eval.ssim,
@@ -210,7 +238,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         duration(train_secs)
     ));
     console.note(format_args!("look at `{}`", run_dir.report_path().display()));
-    Ok(Trained { run_dir, dataset, cloud, eval, report })
+    Ok(Trained { run_dir, dataset, cloud, num_steps, eval, report })
 }
 
 /// Decodes what fits into the cache, so that an image that cannot be read ends the run before it begins.
@@ -226,7 +254,7 @@ fn salvage(failure: Failure, run_dir: &RunDir, cloud: &GaussianCloud, num_steps:
     if num_steps == 0 || cloud.is_empty() {
         return failure;
     }
-    let path = run_dir.path().join("unfinished.ply");
+    let path = run_dir.unfinished_path();
     match gazesplat_core::io::ply::save(&path, cloud) {
         Ok(()) => failure.hint(format!("the model as it was after step {num_steps} is in `{}`", path.display())),
         Err(_) => failure,

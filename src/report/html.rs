@@ -2,7 +2,7 @@
 
 use super::pictures::{self, ERROR_SCALE};
 use super::plots::{self, Curve, Scale};
-use super::{Report, ViewPanel};
+use super::{Measured, Report, ViewPanel};
 use crate::console::{duration, grouped};
 use std::fmt::Write as _;
 
@@ -86,10 +86,11 @@ fn film(out: &mut String, report: &Report) {
 
 fn views(out: &mut String, report: &Report) {
     let Some((first, rest)) = report.views.split_first() else { return };
-    put!(
-        out,
-        "<section><h2>Test views</h2><p>Photographs that training never saw, beside what the model makes of them. "
-    );
+    let (heading, which) = match report.measured {
+        Measured::Test => ("Test views", "that training never saw"),
+        Measured::Training => ("Training views", "that the model was trained on"),
+    };
+    put!(out, "<section><h2>{heading}</h2><p>Photographs {which}, beside what the model makes of them. ");
     put!(out, "Drag across the first: left of the line is the photograph, right of it the render.</p>");
     comparison(out, first);
     for view in rest {
@@ -138,10 +139,11 @@ fn curves(out: &mut String, report: &Report) {
     let trend = plots::smoothed(&loss, loss.len() as f64 / 40.0);
     let count = report.steps.iter().map(|s| (f64::from(s.step), s.num_gaussians as f64)).collect();
     let psnr = report.test_psnr.iter().map(|&(step, db)| (f64::from(step), db)).collect();
+    let psnr_name = format!("PSNR on the {} views", report.measured.name());
     let plots = [
         ("Loss", plots::over_steps(&[line(loss, ORANGE, 0.3, 1), line(trend, ORANGE, 1.0, 2)], Scale::Log, "")),
         (
-            "PSNR on the test views",
+            psnr_name.as_str(),
             plots::over_steps(&[Curve { dots: true, ..line(psnr, BLUE, 1.0, 2) }], Scale::Linear, " dB"),
         ),
         ("Gaussians", plots::over_steps(&[line(count, GREEN, 1.0, 2)], Scale::Linear, "")),
@@ -195,7 +197,8 @@ fn details(out: &mut String, report: &Report) {
         put!(out, "</table></section>\n");
     }
     if !report.scores.is_empty() {
-        put!(out, "<section><details><summary>All {} test views</summary><table>", grouped(report.scores.len()));
+        let (count, which) = (grouped(report.scores.len()), report.measured.name());
+        put!(out, "<section><details><summary>All {count} {which} views</summary><table>");
         put!(out, "<tr><th>view</th><th>PSNR</th><th>SSIM</th></tr>");
         for (name, psnr, ssim) in &report.scores {
             put!(out, "<tr><td>{}</td><td>{psnr:.2} dB</td><td>{ssim:.4}</td></tr>", escape(name));
@@ -259,6 +262,9 @@ mod tests {
         for part in ["Fly-through", "Test views", "Loss", "PSNR on the test views", "Gaussians", "Time", "Settings"] {
             assert!(html.contains(part), "{part}");
         }
+        let trained_on = page(&Report { measured: Measured::Training, ..sample() });
+        assert!(trained_on.contains("Training views") && trained_on.contains("PSNR on the training views"));
+        assert!(!trained_on.contains("Test views") && !trained_on.contains("never saw"));
         let empty = page(&Report { title: "x".into(), ..Report::default() });
         for part in ["Fly-through", "Test views", "Loss", "Time", "Settings"] {
             assert!(!empty.contains(part), "{part}");

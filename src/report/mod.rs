@@ -9,9 +9,31 @@ pub mod plots;
 
 use gazesplat_core::RgbImage8;
 
+/// Which views the quality was measured on.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Measured {
+    /// Views kept from training.
+    #[default]
+    Test,
+    /// The very views the model was trained on, for want of others.
+    Training,
+}
+
+impl Measured {
+    /// `test` or `training`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Test => "test",
+            Self::Training => "training",
+        }
+    }
+}
+
 /// Everything a report shows. Empty parts are left out of the page.
 #[derive(Debug, Clone, Default)]
 pub struct Report {
+    /// Which views `test_psnr`, `views` and `scores` are about.
+    pub measured: Measured,
     /// Name of the scene.
     pub title: String,
     /// One sentence under the title.
@@ -20,13 +42,13 @@ pub struct Report {
     pub headline: Vec<Figure>,
     /// Logged steps, in order.
     pub steps: Vec<StepPoint>,
-    /// Test-view PSNR over the run, (step, dB).
+    /// PSNR of the measured views over the run, (step, dB).
     pub test_psnr: Vec<(u32, f64)>,
     /// Mean milliseconds per training step by stage, in the order of execution.
     pub stages: Vec<(String, f64)>,
-    /// Test views with their renders.
+    /// Some of the measured views with their renders.
     pub views: Vec<ViewPanel>,
-    /// Every test view: name, PSNR in dB, SSIM.
+    /// Every measured view: name, PSNR in dB, SSIM.
     pub scores: Vec<(String, f64, f64)>,
     /// Frames of a camera path through the model, to play.
     pub film: Vec<RgbImage8>,
@@ -69,7 +91,7 @@ pub struct StepPoint {
     pub num_gaussians: usize,
 }
 
-/// A test view: the photograph, what the model makes of it, and how well.
+/// A measured view: the photograph, what the model makes of it, and how well.
 #[derive(Debug, Clone)]
 pub struct ViewPanel {
     /// Name of the view.

@@ -1,6 +1,6 @@
 //! Damaged, missing and misplaced input: a clear error, a hint, status 2, and nothing left half-written.
 
-use crate::support::{Place, SHORT};
+use crate::support::{Place, SHORT, break_rows};
 use std::fs;
 
 /// Trains on `scene`, which must be refused without leaving a run behind.
@@ -117,6 +117,38 @@ fn model_that_ends_early() {
     let said = place.run(&["render", "run", "--scene", "scene", "--out", "frames"]).refused();
     assert!(said.contains("point_cloud.ply"), "{said}");
     assert!(!place.path("frames").exists());
+}
+
+#[test]
+fn model_without_a_usable_gaussian() {
+    let place = Place::with_run();
+    let refused_by_both = |model: &str| {
+        for args in [["eval", model, "--scene", "scene"].as_slice(), &["render", model, "--scene", "scene"]] {
+            let said = place.run(args).refused();
+            assert!(said.contains(model) && said.contains("no Gaussian that can be drawn"), "{said}");
+        }
+        assert!(!place.path("renders").exists());
+    };
+    let whole = fs::read(place.path("run/point_cloud.ply")).expect("readable");
+    let end = b"end_header\n";
+    let data = whole.windows(end.len()).position(|w| w == end).expect("a PLY header") + end.len();
+    let header = String::from_utf8_lossy(&whole[..data]).replace("element vertex 600", "element vertex 0");
+    place.write("empty.ply", header);
+    refused_by_both("empty.ply");
+    place.write("broken.ply", whole);
+    break_rows(&place, "broken.ply", usize::MAX);
+    refused_by_both("broken.ply");
+}
+
+#[test]
+fn model_with_some_broken_rows_is_drawn_without_them() {
+    let place = Place::with_run();
+    fs::copy(place.path("run/point_cloud.ply"), place.path("some.ply")).expect("writable");
+    break_rows(&place, "some.ply", 3);
+    for args in [["eval", "some.ply", "--scene", "scene"].as_slice(), &["render", "some.ply", "--scene", "scene"]] {
+        let told = place.run(args).done().stderr;
+        assert!(told.contains("warning: `some.ply`: left out 3 of 600 Gaussians"), "{told}");
+    }
 }
 
 #[test]

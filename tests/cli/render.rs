@@ -97,6 +97,10 @@ fn options_out_of_range_are_refused() {
         let flag = format!("{}={}", wrong[0], wrong[1]);
         let ended = place.run(&["render", "run", "--scene", "scene", "--out", "f", &flag]);
         assert_eq!(ended.code, 2, "{flag}");
+        // The others are refused by the parser, which shows what the option takes.
+        if ["--alpha-max", "--near"].contains(&wrong[0]) {
+            assert!(ended.refused().contains("gazesplat render --help"), "{flag}");
+        }
         assert!(!place.path("f").exists(), "{flag}");
     }
 }

@@ -62,9 +62,13 @@ fn missing_file_lists_the_presets() {
 
 #[test]
 fn value_out_of_range_is_refused_before_the_scene_is_read() {
-    let ended = Place::new().run(&["train", "no such scene", "--set", "train.steps=0"]);
-    assert_eq!(ended.code, 2);
-    assert!(ended.stderr.contains("train.steps"), "{}", ended.stderr);
+    let place = Place::new();
+    for wrong in ["train.steps=0", "render.alpha_max=0.99999", "render.alpha_max=0.002", "render.near=0"] {
+        let said = place.run(&["train", "no such scene", "--set", wrong, "--out", "out"]).refused();
+        let (key, _) = wrong.split_once('=').expect("a key");
+        assert!(said.contains(key) && said.contains("gazesplat train --help"), "{said}");
+        assert!(!place.path("out").exists(), "{wrong}");
+    }
 }
 
 #[test]

@@ -106,6 +106,19 @@ impl Place {
     }
 }
 
+/// Overwrites the first value of the first `num_rows` rows of the binary model `name` by NaN.
+pub fn break_rows(place: &Place, name: &str, num_rows: usize) {
+    let mut bytes = fs::read(place.path(name)).expect("readable");
+    let end = b"end_header\n";
+    let data = bytes.windows(end.len()).position(|w| w == end).expect("a PLY header") + end.len();
+    let header = String::from_utf8_lossy(&bytes[..data]).into_owned();
+    let row_bytes = 4 * header.matches("property float").count();
+    for row in bytes[data..].chunks_exact_mut(row_bytes).take(num_rows) {
+        row[..4].copy_from_slice(&f32::NAN.to_le_bytes());
+    }
+    place.write(name, bytes);
+}
+
 /// Options of a training that is over in a moment.
 pub const SHORT: [&str; 8] =
     ["--set", "train.steps=40", "--set", "densify.cap=600", "--set", "train.threads=2", "--set", "model.sh_degree=1"];

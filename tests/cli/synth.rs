@@ -25,6 +25,16 @@ fn same_seed_gives_the_same_scene() {
 }
 
 #[test]
+fn place_that_cannot_be_written_is_refused_with_the_option() {
+    let place = Place::new();
+    place.write("file", "in the way");
+    for out in ["file", "file/scene"] {
+        let said = place.run(&["synth", "--out", out, "--views", "1", "--size", "32x24"]).refused();
+        assert!(said.contains("`--out`"), "{said}");
+    }
+}
+
+#[test]
 fn existing_directory_is_not_mixed_with_a_scene() {
     let place = Place::with_scene();
     let said = place.run(&["synth", "--out", "scene", "--views", "3", "--size", "32x24"]).refused();

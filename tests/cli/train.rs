@@ -63,6 +63,35 @@ fn finished_run_is_not_replaced_unless_asked() {
 }
 
 #[test]
+fn failed_replacement_keeps_the_old_run_or_leaves_none_of_it() {
+    let place = Place::with_run();
+    let image = place.list("scene/images").remove(3);
+    let whole = std::fs::read(place.path("scene/images").join(&image)).expect("readable");
+    place.write(&format!("scene/images/{image}"), "this is no photograph");
+    let before = place.read("run/settings.toml");
+    train(&place, &["--out", "run", "--overwrite", "--set", "train.seed=5"]).refused();
+    assert_eq!(place.read("run/settings.toml"), before, "nothing is touched before the scene has passed");
+    place.write(&format!("scene/images/{image}"), whole);
+    place.write("run/unfinished.ply", "of an older run");
+    train(&place, &["--out", "run", "--overwrite", "--set", "train.seed=5"]).done();
+    assert!(!place.path("run/unfinished.ply").exists());
+}
+
+#[test]
+fn verbose_tells_decisions_and_details() {
+    let place = Place::with_scene();
+    let plain = train(&place, &["--out", "a"]).done().stderr;
+    assert!(!plain.contains("INFO"), "{plain}");
+    let decisions = train(&place, &["--out", "b", "-v"]).done().stderr;
+    for told in ["2 threads, vector instructions", "settings: 40 steps", "images in memory", "added"] {
+        assert!(decisions.contains(told), "{told}:\n{decisions}");
+    }
+    assert!(!decisions.contains("DEBUG"), "{decisions}");
+    let details = train(&place, &["--out", "c", "-vv"]).done().stderr;
+    assert!(details.contains("DEBUG") && details.contains("forward "), "{details}");
+}
+
+#[test]
 fn runs_without_a_name_are_numbered() {
     let place = Place::with_scene();
     for _ in 0..2 {
@@ -98,6 +127,9 @@ fn every_view_may_train() {
     assert!(told.stderr.contains("quality is measured on the training views"), "{}", told.stderr);
     let eval: Value = serde_json::from_str(&place.read("out/eval.json")).expect("JSON");
     assert_eq!(eval["views"].as_array().map(Vec::len), Some(9));
+    let report = place.read("out/report.html");
+    assert!(report.contains("Training views") && report.contains("training views</summary>"));
+    assert!(!report.contains("Test views") && !report.contains("never saw"));
 }
 
 #[test]

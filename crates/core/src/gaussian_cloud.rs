@@ -88,6 +88,13 @@ impl GaussianCloud {
         Self { sh_degree: degree, sh, ..self.clone() }
     }
 
+    /// Lowest SH degree that holds every coefficient that is not 0.
+    pub fn highest_nonzero_degree(&self) -> u32 {
+        let rows = self.sh.chunks_exact(self.num_coefficients());
+        let last = rows.filter_map(|row| row.iter().rposition(|c| *c != [0.0; 3])).max().unwrap_or(0);
+        (0..self.sh_degree).find(|&degree| crate::sh::num_coefficients(degree) > last).unwrap_or(self.sh_degree)
+    }
+
     /// This cloud followed by `other`, with the higher of the two SH degrees.
     pub fn concat(&self, other: &Self) -> Self {
         let degree = self.sh_degree.max(other.sh_degree);
@@ -207,6 +214,19 @@ mod tests {
         let c = cloud(3, 2);
         assert_eq!(c.with_sh_degree(4).with_sh_degree(2), c);
         assert_eq!(c.with_sh_degree(0).sh_of(2), &c.sh_of(2)[..1]);
+    }
+
+    #[test]
+    fn highest_degree_in_use_is_found() {
+        for degree in 0..=3 {
+            assert_eq!(cloud(3, degree).highest_nonzero_degree(), degree);
+            assert_eq!(cloud(3, degree).with_sh_degree(4).highest_nonzero_degree(), degree);
+        }
+        let mut sparse = GaussianCloud::zeros(5, 3);
+        assert_eq!(sparse.highest_nonzero_degree(), 0);
+        sparse.sh[2 * 16 + 4] = [0.0, -1.0, 0.0];
+        assert_eq!(sparse.highest_nonzero_degree(), 2);
+        assert_eq!(GaussianCloud::zeros(0, 3).highest_nonzero_degree(), 0);
     }
 
     #[test]

@@ -40,13 +40,24 @@ pub struct TrainSection {
     pub threads: usize,
     /// A step is reported to logs every this many steps, and after the last; at least 1. Default 10.
     pub log_every: u32,
-    /// The test views are measured every this many steps, and after the last; 0 = only after the last. Default 5000.
+    /// The test views are measured every this many steps, and after the last; 0 = only after the last. At most 1/6 of
+    /// the run, unless measuring that often would take more than some 5 % of its time. Default 5000.
     pub eval_every: u32,
 }
 
 impl Default for TrainSection {
     fn default() -> Self {
         Self { steps: 30_000, seed: 0, threads: 0, log_every: 10, eval_every: 5000 }
+    }
+}
+
+impl TrainSection {
+    /// Steps between two measurements of `num_test` test views on the way; `None` = only after the last step.
+    pub fn eval_interval(&self, num_test: usize) -> Option<u32> {
+        // Measuring a view takes about half as long as a step: ten steps per view keep it at 5 % of the time.
+        let least = u32::try_from(num_test).unwrap_or(u32::MAX).saturating_mul(10);
+        let upper = (self.steps / 6).max(least).max(1);
+        (self.eval_every > 0).then(|| self.eval_every.min(upper))
     }
 }
 
@@ -320,8 +331,12 @@ impl Config {
         non_negative("densify.scale_regularizer", self.densify.scale_regularizer)?;
         let ssim_weight = self.loss.ssim_weight;
         check((0.0..=1.0).contains(&ssim_weight), "loss.ssim_weight", &ssim_weight, "a number in 0..1")?;
-        positive("render.near", self.render.near)?;
-        open_unit("render.alpha_max", self.render.alpha_max)
+        self.render_options().validate().map_err(|error| match error {
+            gazesplat_render::Error::Parameter { name, found, expected } => {
+                Error::parameter(format!("render.{name}"), format!("found {found}, expected {expected}"))
+            }
+            other => Error::Render(other),
+        })
     }
 }
 
@@ -332,6 +347,28 @@ mod tests {
     #[test]
     fn defaults_are_valid() {
         Config::default().validate().expect("the test sets this up");
+    }
+
+    #[test]
+    fn what_the_renderer_refuses_is_refused_by_its_key() {
+        for (near, alpha_max, key) in
+            [(0.01, 0.99999, "render.alpha_max"), (0.01, 0.001, "render.alpha_max"), (-1.0, 0.99, "render.near")]
+        {
+            let mut config = Config::default();
+            (config.render.near, config.render.alpha_max) = (near, alpha_max);
+            let message = config.validate().expect_err("the test expects a refusal").to_string();
+            assert!(message.starts_with(key), "{message}");
+        }
+    }
+
+    #[test]
+    fn short_runs_are_measured_on_the_way_but_not_all_the_time() {
+        let section = |steps, eval_every| TrainSection { steps, eval_every, ..TrainSection::default() };
+        assert_eq!(section(30_000, 5000).eval_interval(30), Some(5000));
+        assert_eq!(section(3000, 5000).eval_interval(7), Some(500));
+        assert_eq!(section(300, 5000).eval_interval(20), Some(200));
+        assert_eq!(section(3000, 100).eval_interval(7), Some(100));
+        assert_eq!(section(3000, 0).eval_interval(7), None);
     }
 
     #[test]

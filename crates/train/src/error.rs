@@ -65,7 +65,8 @@ impl Error {
                 "the model before this step is intact; check the image of the view, or lower the learning rates".into(),
             ),
             Self::Threads { .. } => Some("set train.threads to a smaller number, or to 0 for one per core".into()),
-            Self::Render(_) | Self::Parameter { .. } | Self::Observer(_) => None,
+            Self::Parameter { .. } => Some("`gazesplat train --help` lists every setting with its default".into()),
+            Self::Render(_) | Self::Observer(_) => None,
         }
     }
 }

@@ -25,12 +25,13 @@ const LOAD_BATCH: usize = 16;
 /// # Errors
 /// As [`Trainer::step`]; the trainer then holds the last good model. [`Error::Observer`] when an observer fails.
 pub fn run(trainer: &mut Trainer, observers: &mut [&mut dyn Observer], stop: &AtomicBool) -> Result<Outcome> {
-    let (num_steps, eval_every) = (trainer.config().train.steps, trainer.config().train.eval_every);
+    let num_steps = trainer.config().train.steps;
     for message in trainer.messages() {
         emit(observers, &TrainEvent::Message(message))?;
     }
     load_images(trainer.images(), observers, stop)?;
     let num_test = trainer.test_images().len();
+    let eval_interval = trainer.config().train.eval_interval(num_test);
     emit(
         observers,
         &TrainEvent::Started {
@@ -49,7 +50,7 @@ pub fn run(trainer: &mut Trainer, observers: &mut [&mut dyn Observer], stop: &At
         if let Some(densified) = &report.densified {
             emit(observers, &TrainEvent::Densified { step: report.step, report: densified })?;
         }
-        let is_due = eval_every > 0 && report.step.is_multiple_of(eval_every);
+        let is_due = eval_interval.is_some_and(|interval| report.step.is_multiple_of(interval));
         if num_test > 0 && (is_due || report.step == num_steps) {
             let evaluated = trainer.evaluate()?;
             emit(observers, &TrainEvent::Evaluated { step: report.step, report: &evaluated })?;
@@ -60,14 +61,11 @@ pub fn run(trainer: &mut Trainer, observers: &mut [&mut dyn Observer], stop: &At
     Ok(Outcome::Finished)
 }
 
-/// Runs `job` on `threads` worker threads; 0 = on the threads of the caller's pool, one per core by default.
+/// Runs `job` on `threads` worker threads of its own; 0 = one per core.
 ///
 /// # Errors
 /// [`Error::Threads`] when they cannot be started.
 pub fn with_threads<R: Send>(threads: usize, job: impl FnOnce() -> R + Send) -> Result<R> {
-    if threads == 0 {
-        return Ok(job());
-    }
     let pool = rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()

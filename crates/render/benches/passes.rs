@@ -42,7 +42,7 @@ fn view(camera: &Camera) -> ViewSpec {
     }
 }
 
-fn binned(cloud: &GaussianCloud, camera: &Camera) -> (ProjectedSplats, TileLists) {
+fn binned(cloud: &GaussianCloud, camera: &Camera) -> (ProjectedSplats<'static>, TileLists<'static>) {
     let splats = project(&slices(cloud), &view(camera), None);
     let grid = TileGrid::new(camera.intrinsics.width, camera.intrinsics.height);
     let lists = bin(&splats, grid, true).expect("the bench scene is within limits");

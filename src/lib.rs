@@ -3,6 +3,7 @@
 //! The work itself is done by the crates below this one: [`gazesplat_core`] (scenes and models), [`gazesplat_render`]
 //! (the differentiable renderer) and [`gazesplat_train`] (optimisation). Here they meet files, terminals and people.
 
+pub mod allocator;
 pub mod cli;
 pub mod commands;
 pub mod console;

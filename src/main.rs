@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
+    gazesplat::allocator::keep_freed_memory();
     match gazesplat::cli::run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {

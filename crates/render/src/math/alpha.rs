@@ -24,7 +24,7 @@ pub fn log2_conic(q: Sym2) -> Sym2 {
     Sym2 { xx: -0.5 * LOG2_E * q.xx, xy: -LOG2_E * q.xy, yy: -0.5 * LOG2_E * q.yy }
 }
 
-/// log2 α at the offset (dx, dy) = pixel centre − mean, pixels, for a scaled conic of [`log2_conic`].
+/// log2 α at the offset (dx, dy) = pixel centre − mean, pixels, for a scaled conic of [`log2_conic()`].
 #[cfg_attr(feature = "gpu", cube)]
 #[inline(always)]
 pub fn log2_alpha(q: Sym2, log2_opacity: f32, dx: f32, dy: f32) -> f32 {

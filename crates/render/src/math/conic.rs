@@ -55,7 +55,7 @@ pub fn conic(d: Dilated) -> Sym2 {
     Sym2 { xx: d.cov.yy * inverse, xy: -d.cov.xy * inverse, yy: d.cov.xx * inverse }
 }
 
-/// Gradient of [`conic`] with respect to the scalars of Σ': −Q V Q with Q the conic.
+/// Gradient of [`conic()`] with respect to the scalars of Σ': −Q V Q with Q the conic.
 #[cfg_attr(feature = "gpu", cube)]
 #[inline(always)]
 pub fn conic_vjp(q: Sym2, v: Sym2) -> Sym2 {

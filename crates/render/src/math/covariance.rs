@@ -18,7 +18,7 @@ pub fn factor(r: Mat3, s: Vec3) -> Mat3 {
     }
 }
 
-/// Gradient of [`factor`] with respect to log s: ∂L/∂log s_j = s_j Σ_i V_ij R_ij.
+/// Gradient of [`factor()`] with respect to log s: ∂L/∂log s_j = s_j Σ_i V_ij R_ij.
 #[cfg_attr(feature = "gpu", cube)]
 #[inline(always)]
 pub fn factor_vjp_log_scales(r: Mat3, s: Vec3, v: Mat3) -> Vec3 {

@@ -90,7 +90,7 @@ pub fn outer_vjp(m: Mat2x3, v: Sym2) -> Mat2x3 {
     Mat2x3 { row0: combine(2.0 * v.xx, m.row0, v.xy, m.row1), row1: combine(v.xy, m.row0, 2.0 * v.yy, m.row1) }
 }
 
-/// Gradient of [`project_factor`] with respect to N: Tᵀ V.
+/// Gradient of [`project_factor()`] with respect to N: Tᵀ V.
 #[cfg_attr(feature = "gpu", cube)]
 #[inline(always)]
 pub fn project_factor_vjp_n(t: Mat2x3, v: Mat2x3) -> Mat3 {
@@ -101,7 +101,7 @@ pub fn project_factor_vjp_n(t: Mat2x3, v: Mat2x3) -> Mat3 {
     }
 }
 
-/// Gradient of [`project_factor`] with respect to T: V Nᵀ.
+/// Gradient of [`project_factor()`] with respect to T: V Nᵀ.
 #[cfg_attr(feature = "gpu", cube)]
 #[inline(always)]
 pub fn project_factor_vjp_t(n: Mat3, v: Mat2x3) -> Mat2x3 {
@@ -111,7 +111,7 @@ pub fn project_factor_vjp_t(n: Mat3, v: Mat2x3) -> Mat2x3 {
     }
 }
 
-/// Gradient of [`linearize`] and of the projected mean with respect to the camera-space point.
+/// Gradient of [`linearize()`] and of the projected mean with respect to the camera-space point.
 ///
 /// A clamped ratio is a constant: nothing flows to x or y, and to z only through 1/z.
 #[cfg_attr(feature = "gpu", cube)]

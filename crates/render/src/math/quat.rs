@@ -67,7 +67,7 @@ pub fn rotation(q: Quat) -> Mat3 {
     }
 }
 
-/// Gradient of [`rotation`] ∘ [`normalize`] with respect to the raw quaternion.
+/// Gradient of [`rotation()`] ∘ [`normalize()`] with respect to the raw quaternion.
 #[cfg_attr(feature = "gpu", cube)]
 #[inline(always)]
 pub fn rotation_vjp(unit: UnitQuat, v: Mat3) -> Quat {

@@ -33,7 +33,7 @@ pub(super) struct RowI(pub [i32; LANES]);
 pub(super) struct RasterSplat {
     mean_x: f32,
     mean_y: f32,
-    /// Conic scaled to base-2 logarithms, see [`log2_conic`].
+    /// Conic scaled to base-2 logarithms, see [`log2_conic()`].
     conic: Sym2,
     log2_opacity: f32,
     /// RGB and depth.

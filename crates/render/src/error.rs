@@ -36,4 +36,44 @@ pub enum Error {
         /// What there is.
         limit: u64,
     },
+    /// The GPU that was asked for cannot be used.
+    #[error("no GPU: {message}")]
+    NoAdapter {
+        /// What was asked for and what there is.
+        message: String,
+    },
+    /// The GPU stopped answering: it was lost, has no memory left, or refused a kernel.
+    #[error("the GPU stopped: {message}")]
+    Device {
+        /// What its driver says.
+        message: String,
+    },
+}
+
+impl Error {
+    /// What the driver of a GPU says, without the backtrace that comes with it.
+    pub fn device(cause: &dyn std::fmt::Display) -> Self {
+        let text = cause.to_string();
+        let message = text.split("\nBacktrace").next().unwrap_or_default();
+        Self::Device { message: message.split_whitespace().collect::<Vec<_>>().join(" ") }
+    }
+
+    /// What a person can do about the error, if there is something to suggest.
+    pub fn hint(&self) -> Option<&'static str> {
+        match self {
+            Self::NoAdapter { .. } => Some(
+                "`gazesplat info --devices` lists what can be used; install the driver of your card (or, on Debian, the \
+                 software driver `mesa-vulkan-drivers`), or work with `--device cpu`",
+            ),
+            Self::Device { .. } => Some(
+                "what was saved is intact; free memory of the card, ask for fewer Gaussians or smaller images \
+                 (`densify.cap`, `data.max_side`), or work with `--device cpu`",
+            ),
+            Self::Limit { .. } => Some(
+                "ask for fewer Gaussians or a smaller image, or work with `--device cpu`, which has no such limit of \
+                 buffers",
+            ),
+            Self::Shape { .. } | Self::Parameter { .. } => None,
+        }
+    }
 }

@@ -8,7 +8,10 @@
 #![expect(deprecated, reason = "burn-ndarray is the CPU backend of Burn 0.22, its last line; Flex stands ready")]
 
 pub mod backend;
+pub mod device;
 pub mod error;
+#[cfg(feature = "gpu")]
+pub mod gpu;
 pub mod kernels;
 pub mod layout;
 #[cfg_attr(
@@ -24,10 +27,11 @@ pub mod stats;
 pub mod view_params;
 
 pub use backend::host;
+#[cfg(feature = "flex")]
+pub use device::flex_device;
+pub use device::{DeviceChoice, cpu_device, is_gpu};
 pub use error::{Error, Result};
 pub use options::{Pass, RenderOptions, StatsMode, Termination};
 pub use renderer::{MeansProbe, Rendered, render, render_probed};
-#[cfg(feature = "flex")]
-pub use splats::flex_device;
-pub use splats::{Splats, cpu_device};
+pub use splats::Splats;
 pub use stats::{RenderStats, SplatStats};

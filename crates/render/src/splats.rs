@@ -91,14 +91,3 @@ impl Splats {
         }
     }
 }
-
-/// The CPU as a Burn device: burn-ndarray, the default CPU backend of this project.
-pub fn cpu_device() -> Device {
-    Device::ndarray()
-}
-
-/// The CPU through Burn's successor of burn-ndarray; the kernels are the same.
-#[cfg(feature = "flex")]
-pub fn flex_device() -> Device {
-    Device::flex()
-}

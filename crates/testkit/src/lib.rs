@@ -7,6 +7,7 @@
 
 pub mod close;
 pub mod data;
+pub mod devices;
 pub mod finite_diff;
 pub mod golden;
 pub mod reference;

@@ -1,0 +1,180 @@
+//! Working on a GPU: buffers, sizes of dispatches, and what an adapter must have.
+//!
+//! [`Gpu`] is a client of one adapter. Everything it allocates is contiguous; an allocation that is larger than the
+//! adapter takes is refused before any work with [`Error::Limit`]. Work is queued; only [`Gpu::read_u32`] and
+//! [`Gpu::read_f32`] wait for it, and they are where a lost adapter or a full memory shows.
+
+use crate::error::{Error, Result};
+use burn::backend::DispatchDevice;
+use burn::tensor::{DType, Device, Shape};
+use burn_cubecl::kernel::into_contiguous;
+use burn_cubecl::ops::numeric::{empty_device_contiguous_dtype, zeros_client};
+use burn_cubecl::{CubeDevice, tensor::CubeTensor};
+use cubecl::client::Client;
+use cubecl::prelude::*;
+use cubecl::server::CubeCountSelection;
+
+pub mod packed;
+
+/// Units (threads) of every workgroup: a tile's pixels. Every desktop adapter and WebGPU's defaults have that many.
+pub const UNITS: u32 = 256;
+
+/// Storage buffers a kernel of ours is given at most, with the one that carries its sizes: WebGPU's default.
+pub const MAX_BUFFERS: u32 = 8;
+
+/// Workgroup memory that the largest kernel takes, bytes: WebGPU's default.
+pub const SHARED_BYTES: usize = 16 * 1024;
+
+/// Where kernels are launched and buffers live.
+#[derive(Clone)]
+pub struct Gpu {
+    /// The queue of the adapter.
+    pub client: Client,
+    device: CubeDevice,
+}
+
+impl Gpu {
+    /// The adapter that `tensor` lives on.
+    pub fn of(tensor: &CubeTensor) -> Self {
+        Self { client: tensor.client.clone(), device: tensor.device.clone() }
+    }
+
+    /// The adapter behind a device; `None` for a CPU.
+    pub fn from_device(device: &Device) -> Option<Self> {
+        fn inner(device: &DispatchDevice) -> Option<&CubeDevice> {
+            match device {
+                DispatchDevice::Cube(device) => Some(device),
+                DispatchDevice::Autodiff(device) => inner(device),
+                _ => None,
+            }
+        }
+        inner(device.as_dispatch()).map(|device| Self { client: device.client(), device: device.clone() })
+    }
+
+    /// A buffer of `shape` with undefined content; `what` names it should it be too large.
+    ///
+    /// # Errors
+    /// [`Error::Limit`] when it is larger than the adapter takes.
+    pub fn empty(&self, what: &'static str, shape: &[usize], dtype: DType) -> Result<CubeTensor> {
+        self.check_size(what, shape, dtype)?;
+        Ok(self.filled(shape, |shape| {
+            empty_device_contiguous_dtype(self.client.clone(), self.device.clone(), shape, dtype)
+        }))
+    }
+
+    /// A buffer of `shape` filled with zeros.
+    ///
+    /// # Errors
+    /// As [`Gpu::empty`].
+    pub fn zeros(&self, what: &'static str, shape: &[usize], dtype: DType) -> Result<CubeTensor> {
+        self.check_size(what, shape, dtype)?;
+        Ok(self.filled(shape, |shape| zeros_client(self.client.clone(), self.device.clone(), shape, dtype)))
+    }
+
+    /// A tensor of `shape` on what `make` allocates: never nothing, since no buffer can be bound that holds no byte.
+    fn filled(&self, shape: &[usize], make: impl FnOnce(Shape) -> CubeTensor) -> CubeTensor {
+        let len = shape.iter().product::<usize>();
+        let tensor = make(Shape::from(vec![len.max(1)]));
+        let (handle, dtype) = (tensor.handle, tensor.dtype);
+        CubeTensor::new_contiguous(self.client.clone(), self.device.clone(), Shape::from(shape.to_vec()), handle, dtype)
+    }
+
+    /// Checks that the adapter takes a buffer of that size.
+    ///
+    /// # Errors
+    /// [`Error::Limit`].
+    pub fn check_size(&self, what: &'static str, shape: &[usize], dtype: DType) -> Result<()> {
+        let needed = shape.iter().map(|&d| d as u64).product::<u64>().saturating_mul(dtype.size() as u64);
+        let limit = self.client.properties().memory.max_page_size;
+        match needed > limit {
+            true => Err(Error::Limit { what, needed, limit }),
+            false => Ok(()),
+        }
+    }
+
+    /// Uploads words as a `u32` buffer of `shape`.
+    pub fn upload_u32(&self, words: &[u32], shape: &[usize]) -> CubeTensor {
+        let words = if words.is_empty() { &[0][..] } else { words };
+        let handle = self.client.create_from_slice(bytemuck::cast_slice(words));
+        let shape = Shape::from(shape.to_vec());
+        CubeTensor::new_contiguous(self.client.clone(), self.device.clone(), shape, handle, DType::U32)
+    }
+
+    /// Waits for the queue and downloads a `u32` buffer.
+    ///
+    /// # Errors
+    /// [`Error::Device`] when the adapter was lost, has no memory left, or refused a kernel on the way.
+    pub fn read_u32(&self, tensor: &CubeTensor) -> Result<Vec<u32>> {
+        self.read(tensor)
+    }
+
+    /// Waits for the queue and downloads an `f32` buffer.
+    ///
+    /// # Errors
+    /// As [`Gpu::read_u32`].
+    pub fn read_f32(&self, tensor: &CubeTensor) -> Result<Vec<f32>> {
+        self.read(tensor)
+    }
+
+    fn read<T: bytemuck::AnyBitPattern>(&self, tensor: &CubeTensor) -> Result<Vec<T>> {
+        let len = tensor.meta.num_elements();
+        if len == 0 {
+            return Ok(Vec::new());
+        }
+        let bytes = self.client.read_one(tensor.handle.clone()).map_err(|e| Error::device(&e))?;
+        let size = size_of::<T>();
+        Ok(bytes.chunks_exact(size).take(len).map(bytemuck::pod_read_unaligned).collect())
+    }
+
+    /// A dispatch of at least `num_cubes` workgroups, spread over three axes where one is too short: kernels compare
+    /// `CUBE_POS` or `ABSOLUTE_POS` with their size.
+    pub fn cubes(&self, num_cubes: usize) -> CubeCount {
+        CubeCountSelection::new(&self.client, num_cubes as u32).cube_count()
+    }
+
+    /// A dispatch of at least `num_units` units in workgroups of [`UNITS`].
+    pub fn units(&self, num_units: usize) -> CubeCount {
+        self.cubes(num_units.div_ceil(UNITS as usize))
+    }
+}
+
+/// The shape of every workgroup.
+pub fn cube_dim() -> CubeDim {
+    CubeDim::new_1d(UNITS)
+}
+
+/// The tensor with its values in C order, copied only if they are not.
+pub fn contiguous(tensor: CubeTensor) -> CubeTensor {
+    into_contiguous(tensor)
+}
+
+/// Checks that an adapter has what every kernel needs.
+///
+/// # Errors
+/// [`Error::Limit`] naming the first thing it has too little of.
+pub(crate) fn check_limits(device: &Device) -> Result<()> {
+    let Some(gpu) = Gpu::from_device(device) else { return Ok(()) };
+    let has = &gpu.client.properties().hardware;
+    let limits = [
+        ("units of a workgroup", u64::from(UNITS), u64::from(has.max_units_per_cube)),
+        // One is kept for the sizes of the others.
+        ("storage buffers of a kernel", u64::from(MAX_BUFFERS - 1), u64::from(has.max_bindings)),
+        ("bytes of workgroup memory", SHARED_BYTES as u64, has.max_shared_memory_size as u64),
+    ];
+    match limits.into_iter().find(|(_, needed, limit)| needed > limit) {
+        Some((what, needed, limit)) => Err(Error::Limit { what, needed, limit }),
+        None => Ok(()),
+    }
+}
+
+/// The device functions that kernels of several files use.
+#[expect(missing_docs, reason = "what the kernel macros generate carries no documentation")]
+pub mod device_fn {
+    use cubecl::prelude::*;
+
+    /// True if `x` is neither infinite nor NaN. By its bits: shader compilers may assume that neither exists.
+    #[cube]
+    pub fn is_finite(x: f32) -> bool {
+        (u32::reinterpret(x) & 0x7f80_0000u32) != 0x7f80_0000u32
+    }
+}

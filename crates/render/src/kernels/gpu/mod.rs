@@ -1,0 +1,8 @@
+//! The passes on a GPU: CubeCL kernels, the mirror of [`super::cpu`] file by file.
+//!
+//! Order of a frame: [`project`] → [`sort`] (with [`scan`]) → [`bin`] → [`rasterize`]; backwards [`rasterize_bwd`] →
+//! [`project_bwd`]. No float is ever added atomically: every sum has a fixed order, so one adapter gives the same bits
+//! on every run. No kernel depends on the size of a subgroup.
+
+pub mod scan;
+pub mod sort;

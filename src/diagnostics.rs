@@ -192,8 +192,7 @@ impl From<gazesplat_render::Error> for Failure {
             gazesplat_render::Error::Parameter { expected, .. } => {
                 Some(format!("give {expected}; `gazesplat render --help` has the default"))
             }
-            gazesplat_render::Error::Limit { .. } => Some("draw a smaller image or a smaller model".to_owned()),
-            gazesplat_render::Error::Shape { .. } => None,
+            other => other.hint().map(str::to_owned),
         };
         Self::new(error.to_string()).hint_if(hint)
     }

@@ -70,7 +70,7 @@ impl Error {
                  (`densify.cap`, `data.max_side`), or work with `--device cpu`",
             ),
             Self::Limit { .. } => Some(
-                "ask for fewer Gaussians or a smaller image, or work with `--device cpu`, which has no such limit of \
+                "ask for fewer Gaussians or a smaller image; on a GPU, `--device cpu` has no such limits of \
                  buffers",
             ),
             Self::Shape { .. } | Self::Parameter { .. } => None,

@@ -7,7 +7,7 @@ use gazesplat_render::StatsMode;
 use gazesplat_render::simd::{self, SimdLevel};
 use gazesplat_testkit::{Tolerance, assert_close};
 
-#[expect(dead_code, reason = "this binary needs some of the scenes only")]
+#[expect(dead_code, unused_macros, unused_imports, reason = "this binary needs some of the scenes only")]
 mod common;
 
 use common::scenes::{Draw, random, upstream};

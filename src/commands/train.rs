@@ -277,3 +277,36 @@ fn facts(job: &TrainJob<'_>, dataset: &Dataset, run_dir: &RunDir) -> Vec<(String
     facts.push(("spherical harmonics".to_owned(), format!("degree {}", job.config.model.sh_degree)));
     facts
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gazesplat_core::io::ply;
+
+    fn one_gaussian() -> GaussianCloud {
+        GaussianCloud {
+            means: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            log_scales: vec![[0.0; 3]],
+            opacity_logits: vec![0.0],
+            sh_degree: 0,
+            sh: vec![[0.0; 3]],
+        }
+    }
+
+    #[test]
+    fn failed_training_leaves_its_last_model_and_says_of_which_step_it_is() {
+        let dir = tempfile::tempdir().expect("temporary directory");
+        let run_dir = RunDir::create(dir.path(), false).expect("writable");
+        let lost = || Failure::from(gazesplat_render::Error::Device { message: "device lost".to_owned() });
+        for nothing in [None, Some(Kept { step: 0, cloud: one_gaussian() })] {
+            salvage(lost(), &run_dir, nothing);
+            assert!(!run_dir.unfinished_path().exists(), "a model without a step is none");
+        }
+        let report = salvage(lost(), &run_dir, Some(Kept { step: 20, cloud: one_gaussian() })).report(false);
+        assert_eq!(ply::load(run_dir.unfinished_path()).expect("readable"), one_gaussian());
+        assert!(report.contains("hint: the model as it was after step 20 is in `"), "{report}");
+        assert!(report.contains("unfinished.ply`; what was saved is intact; free memory of the card"), "{report}");
+        assert!(!run_dir.model_path().exists(), "nobody takes it for a finished run");
+    }
+}

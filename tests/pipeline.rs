@@ -1,5 +1,6 @@
 //! The whole way through the library: scene, training, measurement, rendering; and real captures when they are at hand.
 
+use gazesplat::commands::device::ComputeDevice;
 use gazesplat::commands::train::{TrainJob, Trained, train};
 use gazesplat::{Console, Settings};
 use gazesplat_core::dataset::LoadOptions;
@@ -17,7 +18,8 @@ use std::sync::atomic::AtomicBool;
 fn run(scene: &Path, out: &Path, overrides: &[&str]) -> Trained {
     let overrides: Vec<String> = overrides.iter().map(|&o| o.to_owned()).collect();
     let config = Settings::new().with_overrides(&overrides).and_then(|s| s.resolve()).expect("valid settings");
-    let job = TrainJob { scene, config, out: Some(out), overwrite: false };
+    let device = &ComputeDevice::cpu();
+    let job = TrainJob { scene, config, out: Some(out), overwrite: false, device };
     train(&job, &AtomicBool::new(false), &Console::quiet()).expect("training works")
 }
 

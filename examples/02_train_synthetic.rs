@@ -45,7 +45,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     run(&mut trainer, &mut [&mut Teller], &AtomicBool::new(false))?;
 
     let model = dir.join("model.ply");
-    ply::save(&model, &trainer.to_cloud())?;
+    ply::save(&model, &trainer.to_cloud()?)?;
     eprintln!("wrote {}", model.display());
     Ok(())
 }

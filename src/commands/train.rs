@@ -174,7 +174,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     recorder.flush()?;
     let train_secs = started.elapsed().as_secs_f64();
     durations.push(("training".to_owned(), train_secs));
-    let cloud = trainer.to_cloud();
+    let cloud = trainer.to_cloud()?;
     let num_steps = trainer.step_index();
     let outcome = match ended {
         Ok(outcome) => outcome,

@@ -1,5 +1,6 @@
 //! A Gaussian model as tensors.
 
+use crate::error::{Error, Result};
 use burn::tensor::{Device, Tensor, TensorData};
 use gazesplat_core::GaussianCloud;
 
@@ -34,19 +35,25 @@ impl Splats {
     }
 
     /// Downloads the model.
-    pub fn to_cloud(&self) -> GaussianCloud {
-        fn rows<const D: usize, const W: usize>(tensor: &Tensor<D>) -> Vec<[f32; W]> {
-            let data = tensor.to_data().to_vec::<f32>().expect("splat parameters are f32");
-            data.as_chunks().0.to_vec()
+    ///
+    /// # Errors
+    /// [`Error::Device`] when a GPU does not answer.
+    pub fn to_cloud(&self) -> Result<GaussianCloud> {
+        fn values<const D: usize>(tensor: &Tensor<D>) -> Result<Vec<f32>> {
+            let data = tensor.try_to_data().map_err(|e| Error::device(&e))?;
+            Ok(data.try_into_vec().expect("splat parameters are f32"))
         }
-        GaussianCloud {
-            means: rows(&self.means),
-            quats: rows(&self.quats),
-            log_scales: rows(&self.log_scales),
-            opacity_logits: self.opacity_logits.to_data().to_vec().expect("splat parameters are f32"),
+        fn rows<const D: usize, const W: usize>(tensor: &Tensor<D>) -> Result<Vec<[f32; W]>> {
+            Ok(values(tensor)?.as_chunks().0.to_vec())
+        }
+        Ok(GaussianCloud {
+            means: rows(&self.means)?,
+            quats: rows(&self.quats)?,
+            log_scales: rows(&self.log_scales)?,
+            opacity_logits: values(&self.opacity_logits)?,
             sh_degree: self.sh_degree(),
-            sh: rows(&self.sh),
-        }
+            sh: rows(&self.sh)?,
+        })
     }
 
     /// Number of Gaussians N.

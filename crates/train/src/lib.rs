@@ -4,12 +4,14 @@
 //! budget, evaluates on the way and tells [`Observer`]s what happens. Sources, as cited in the code: `3DGS` = Kerbl 2023,
 //! `MCMC` = Kheradmand 2024, Wang 2004 (SSIM), Kingma 2015 (Adam).
 
+pub mod backend;
 pub mod config;
 pub mod densify;
 pub mod error;
 pub mod evaluate;
 pub mod event;
 pub mod init;
+pub mod kernels;
 pub mod losses;
 pub mod metrics;
 pub mod optim;

@@ -69,7 +69,7 @@ struct Log {
 impl Observer for Log {
     fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         match event {
-            TrainEvent::Step(report) => self.losses.push(report.loss),
+            TrainEvent::Step(report) => self.losses.extend(report.losses.as_ref().map(|l| l.total)),
             TrainEvent::Message(text) => self.messages.push((*text).to_string()),
             TrainEvent::Evaluated { report, .. } => self.psnr = Some(report.psnr),
             TrainEvent::Densified { .. } => self.num_densified += 1,
@@ -93,7 +93,7 @@ fn a_short_run_on_the_room_reaches_its_quality_floor() {
     let psnr = log.psnr.unwrap();
     println!("test PSNR {:.2} dB, before training {:.2} dB", psnr, before.psnr);
     assert!(psnr > PSNR_FLOOR_DB && psnr > before.psnr + 3.0, "{psnr} {}", before.psnr);
-    let cloud = trainer.to_cloud();
+    let cloud = trainer.to_cloud().unwrap();
     assert_eq!((cloud.len(), cloud.sh_degree), (6000, 3));
     cloud.validate().unwrap();
 }
@@ -110,7 +110,7 @@ fn the_model_does_not_depend_on_the_number_of_threads() {
             with_threads(threads, || {
                 let mut trainer = trainer(&dataset, &config(60, 3000));
                 run(&mut trainer, &mut [], &AtomicBool::new(false)).unwrap();
-                trainer.to_cloud()
+                trainer.to_cloud().unwrap()
             })
             .unwrap()
         })
@@ -131,7 +131,7 @@ fn a_stopped_run_continues_to_the_model_of_an_unbroken_one() {
     assert_eq!(run(&mut stopped, &mut [], &AtomicBool::new(true)).unwrap(), Outcome::Stopped);
     assert_eq!(stopped.step_index(), 17);
     run(&mut stopped, &mut [], &AtomicBool::new(false)).unwrap();
-    assert!(stopped.to_cloud() == unbroken.to_cloud());
+    assert!(stopped.to_cloud().unwrap() == unbroken.to_cloud().unwrap());
 }
 
 #[test]
@@ -152,20 +152,20 @@ fn a_scene_without_points_starts_at_random_and_says_so() {
 fn a_loss_that_is_no_number_stops_the_run_and_keeps_the_model() {
     let (_scratch, dataset) = scene("nan", 4);
     let settings = config(10, 2500);
-    let mut cloud = trainer(&dataset, &settings).to_cloud();
+    let mut cloud = trainer(&dataset, &settings).to_cloud().unwrap();
     cloud.sh[16 * 7] = [f32::MAX; 3];
     let images = Arc::new(ImageCache::new(dataset.train.clone(), settings.data.cache_bytes));
     let mut trainer = Trainer::from_cloud(&cloud, &dataset, images, &settings, &cpu_device()).unwrap();
     // Views that do not see the Gaussian pass.
     let (before, error) = (0..10)
         .find_map(|_| {
-            let before = trainer.to_cloud();
+            let before = trainer.to_cloud().unwrap();
             trainer.step().err().map(|error| (before, error))
         })
         .unwrap();
     let message = error.to_string();
     assert!(message.contains("view_00") && message.contains("sh of Gaussian 7"), "{message}");
-    assert!(trainer.to_cloud() == before);
+    assert!(trainer.to_cloud().unwrap() == before);
 }
 
 #[cfg(feature = "flex")]
@@ -177,7 +177,7 @@ fn both_cpu_backends_train_the_same_model() {
         let images = Arc::new(ImageCache::new(dataset.train.clone(), settings.data.cache_bytes));
         let mut trainer = Trainer::new(&dataset, images, &settings, device).unwrap();
         run(&mut trainer, &mut [], &AtomicBool::new(false)).unwrap();
-        trainer.to_cloud()
+        trainer.to_cloud().unwrap()
     };
     assert!(train(&cpu_device()) == train(&gazesplat_render::flex_device()));
 }

@@ -2,8 +2,9 @@
 
 use gazesplat_render::simd::SimdLevel;
 use gazesplat_testkit::golden;
+use gazesplat_train::kernels::cpu::adam::{Step, update};
 use gazesplat_train::losses::ssim_kernel::{Comparison, Weights, similarity, similarity_and_gradient};
-use gazesplat_train::optim::adam::{AdamSettings, Step, update};
+use gazesplat_train::optim::AdamSettings;
 
 /// f32 arithmetic on images of up to 56 × 40: the sums themselves are exact to about 1e-7.
 const VALUE_TOLERANCE: f64 = 1e-6;

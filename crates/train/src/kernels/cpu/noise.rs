@@ -19,7 +19,7 @@ const MIN_GATE: f32 = 1e-6;
 const CHUNK: usize = 4096;
 
 /// Adds noise of strength `strength` (learning rate of the means times the noise multiple) to the means.
-pub(super) fn add_noise(params: &mut Columns, strength: f32, seed: u64, step: u32) {
+pub fn add_noise(params: &mut Columns, strength: f32, seed: u64, step: u32) {
     if strength <= 0.0 {
         return;
     }

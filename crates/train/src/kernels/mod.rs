@@ -1,0 +1,3 @@
+//! The kernels of training, one file each, per kind of processor.
+
+pub mod cpu;

@@ -13,6 +13,11 @@ pub mod event;
 pub mod init;
 pub mod kernels;
 pub mod losses;
+#[cfg_attr(
+    feature = "gpu",
+    expect(missing_docs, reason = "the device-side twins that the macros generate carry no documentation")
+)]
+pub mod math;
 pub mod metrics;
 pub mod optim;
 pub mod rng;

@@ -8,6 +8,8 @@
 #![expect(deprecated, reason = "burn-ndarray is this project's default CPU backend until its successor replaces it")]
 
 mod cpu;
+#[cfg(feature = "gpu")]
+mod gpu;
 
 use crate::event::DensifyReport;
 use crate::optim::{AdamSettings, LearningRates, Regularizers};
@@ -134,7 +136,7 @@ impl Refinement {
 ///
 /// `shared` says that something outside the state may hold its parameters. A CPU backend sees that for itself; on a GPU
 /// all five tensors are views of one allocation, which hides it, so it works on a copy when told.
-#[backend_extension(NdArray, Flex: cfg(feature = "flex"))]
+#[backend_extension(NdArray, Flex: cfg(feature = "flex"), Cube: cfg(feature = "gpu"))]
 pub trait OptimOps: Backend {
     /// Closes the state if `loss`, `[1]`, is not finite; else adds the gradients of the regularisers to `gradients` and
     /// does one update of all parameters. A group whose gradient has no rows is left alone.

@@ -216,3 +216,7 @@ fn splats(p: Parameters<Dispatch>) -> Splats {
         sh: Tensor::from_dispatch(p.sh),
     }
 }
+
+#[cfg(test)]
+#[path = "state_tests.rs"]
+mod tests;

@@ -10,6 +10,7 @@ pub mod densify;
 pub mod error;
 pub mod evaluate;
 pub mod event;
+mod host;
 pub mod init;
 pub mod kernels;
 pub mod losses;

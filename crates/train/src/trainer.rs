@@ -15,7 +15,7 @@ use crate::evaluate::{EvalReport, evaluate};
 use crate::event::{StageMs, StepReport};
 use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
 use crate::kernels::cpu::rows::Rows;
-use crate::losses::{L1Ssim, LossTarget, LossTerm, LossTerms, WeightedLosses};
+use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses};
 use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, schedule};
 use crate::rng::{Stream, draw, permutation, uniform};
 use burn::tensor::{Device, Gradients, Tensor};
@@ -178,7 +178,7 @@ impl Trainer {
         let rendered = render(&leaves, &self.images.views()[view].camera, &options)?;
         stage_ms.forward = clock.lap();
 
-        let pending = PendingLoss::new(&self.losses, rendered.image, &target);
+        let pending = self.losses.evaluate(rendered.image, &target).expect("a trainer has a loss");
         stage_ms.loss = clock.lap();
 
         let gradients = taken(leaves, pending.loss.backward());
@@ -310,29 +310,6 @@ fn regularizer_terms(weights: Regularizers, status: &Status) -> impl Iterator<It
     let opacity = LossTerm { name: "opacity_regularizer", value: status.mean_opacity };
     let scale = LossTerm { name: "scale_regularizer", value: status.mean_scale };
     [(weights.opacity, opacity), (weights.scale, scale)].into_iter().filter(|(w, _)| *w > 0.0).map(|(_, term)| term)
-}
-
-/// The loss of a step, and its report for when somebody asks.
-struct PendingLoss {
-    /// `[1]`, on the graph of the image.
-    loss: Tensor<1>,
-    terms: LossTerms,
-}
-
-impl PendingLoss {
-    fn new(losses: &WeightedLosses, image: Tensor<3>, target: &LossTarget) -> Self {
-        let (loss, terms) = losses.evaluate(image, target).expect("a trainer has a loss");
-        Self { loss, terms }
-    }
-
-    /// `[1]`, off the graph.
-    fn total(&self) -> Tensor<1> {
-        self.loss.clone().inner()
-    }
-
-    fn read(&self) -> Result<LossTerms> {
-        Ok(self.terms.clone())
-    }
 }
 
 /// Steps between two sortings of the rows. Densification puts new rows at the end and elsewhere in space; neighbours

@@ -9,6 +9,7 @@ pub use schedule::LearningRates;
 pub use state::ModelState;
 
 use crate::error::Result;
+use crate::host::read;
 use burn::tensor::{Device, Tensor, TensorData};
 use gazesplat_core::GaussianCloud;
 use gazesplat_render::Splats;
@@ -73,11 +74,11 @@ impl Columns {
     pub fn from_splats(splats: Splats) -> Result<Self> {
         let [_, num_coefficients, _] = splats.sh.dims();
         let data = [
-            try_into_vec(splats.means)?,
-            try_into_vec(splats.quats)?,
-            try_into_vec(splats.log_scales)?,
-            try_into_vec(splats.opacity_logits)?,
-            try_into_vec(splats.sh)?,
+            read(splats.means)?,
+            read(splats.quats)?,
+            read(splats.log_scales)?,
+            read(splats.opacity_logits)?,
+            read(splats.sh)?,
         ];
         Ok(Self { data, widths: [3, 4, 3, 1, 3 * num_coefficients] })
     }
@@ -147,17 +148,6 @@ impl Columns {
         let broken = candidates.iter().filter(|(.., v)| !v.is_finite()).min_by_key(|(row, ..)| *row);
         broken.or_else(|| candidates.iter().max_by(|a, b| a.2.abs().total_cmp(&b.2.abs()))).copied()
     }
-}
-
-/// The values of a tensor; free on a CPU when it is contiguous and not shared.
-fn try_into_vec<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>> {
-    let data = tensor.try_into_data().map_err(|e| gazesplat_render::Error::device(&e))?;
-    Ok(data.try_into_vec().expect("parameters are f32"))
-}
-
-/// The values of a tensor; free when it is contiguous and not shared.
-pub(crate) fn into_vec<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_into_vec().expect("parameters and gradients are f32")
 }
 
 #[cfg(test)]

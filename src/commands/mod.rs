@@ -19,7 +19,7 @@ use crate::settings::Settings;
 use gazesplat_core::dataset::LoadOptions;
 use gazesplat_core::io::ply;
 use gazesplat_core::{Dataset, GaussianCloud, View};
-use gazesplat_render::kernels::cpu::cluster::morton_order;
+use gazesplat_render::cluster::morton_order;
 use gazesplat_train::Config;
 use std::path::{Path, PathBuf};
 

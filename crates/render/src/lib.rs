@@ -8,6 +8,7 @@
 #![expect(deprecated, reason = "burn-ndarray is the CPU backend of Burn 0.22, its last line; Flex stands ready")]
 
 pub mod backend;
+pub mod cluster;
 pub mod device;
 pub mod error;
 #[cfg(feature = "gpu")]

@@ -269,3 +269,18 @@ fn big_and_faint_against_small_and_strong() {
     assert_eq!((found.pixels_dominated[0], found.tiles_used[0]), (1856, 16));
     assert!(found.pixels_dominated[1..].iter().all(|&v| v == 140) && found.tiles_used[1..].iter().all(|&v| v == 1));
 }
+
+crate::common::on_gpu!(
+    counters_equal_the_reference_off_fragile_pixels,
+    sums_over_gaussians_are_the_totals_of_the_frame,
+    totals_of_the_frame_equal_the_reference,
+    pairs_are_those_whose_alpha_reaches_the_cut_at_pixel_centres,
+    modes_fill_what_they_say,
+    training_counts_what_inference_counts,
+    permuting_gaussians_permutes_their_counters,
+    a_wall_hides_what_stands_behind_it,
+    a_tile_ends_where_its_last_pixel_stops,
+    one_uncovered_pixel_keeps_the_tile_open,
+    the_hidden_one_dominates_nothing,
+    big_and_faint_against_small_and_strong,
+);

@@ -1,6 +1,6 @@
 //! One scene, one result: the same bits on any number of threads and on every call.
 
-use gazesplat_render::kernels::cpu::cluster::morton_order;
+use gazesplat_render::cluster::morton_order;
 use gazesplat_render::{Pass, StatsMode};
 
 use crate::common::scenes::{Draw, random, upstream};

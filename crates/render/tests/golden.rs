@@ -292,3 +292,10 @@ fn golden_projections_equal_the_oracle() {
         }
     }
 }
+
+crate::common::on_gpu!(
+    golden_images_are_within_five_yardsticks,
+    golden_gradients_are_within_five_yardsticks,
+    golden_scenes_bound_the_error_of_float32,
+    golden_images_do_not_depend_on_the_pass,
+);

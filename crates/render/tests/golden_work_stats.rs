@@ -58,3 +58,5 @@ fn golden_work_stats_equal_the_counters() {
     }
     assert!(compared > 0, "none of the scenes of work_stats is there");
 }
+
+crate::common::on_gpu!(golden_work_stats_equal_the_counters,);

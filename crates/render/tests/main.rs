@@ -7,6 +7,7 @@ mod determinism;
 mod finite_diff;
 mod golden;
 mod golden_work_stats;
+mod gpu_equals_cpu;
 mod random_values;
 mod stability;
 mod stability_limits;

@@ -78,3 +78,5 @@ proptest! {
         prop_assert!(frame.image.chunks_exact(5).all(|p| (0.0..=1.0).contains(&p[3])));
     }
 }
+
+crate::common::on_gpu!(image_and_gradients_are_finite_for_any_values,);

@@ -7,7 +7,7 @@ use gazesplat_render::StatsMode;
 use gazesplat_render::simd::{self, SimdLevel};
 use gazesplat_testkit::{Tolerance, assert_close};
 
-#[expect(dead_code, reason = "this binary needs some of the scenes only")]
+#[expect(dead_code, unused_macros, unused_imports, reason = "this binary needs some of the scenes only")]
 mod common;
 
 use common::scenes::{Draw, random, upstream};
@@ -89,7 +89,11 @@ fn levels_agree_in_image_gradients_and_counters() {
             let image = |f: &Frame| sturdy(&f.image, 5, &reference.fragile);
             assert_close(&format!("{what}: image"), &image(&frame), &image(&plain), Tolerance::max_abs(1e-4));
             for ((name, found), (_, expected)) in gradients.groups().into_iter().zip(plain_gradients.groups()) {
-                let d = assert_close(&format!("{what}: {name}"), found, expected, Tolerance::relative_l2(5e-5));
+                // Two levels differ by at most the sum of their distances from float64, which for the needles of scene 3
+                // are up to 2.3e-5 (AVX-512), 4.4e-5 (AVX2) and 2.9e-5 (scalar); elsewhere below 1e-6. The reciprocal
+                // estimates of the vendors differ, so one processor may pass a tighter bound than another.
+                let bound = if k == 3 { 1e-4 } else { 5e-6 };
+                let d = assert_close(&format!("{what}: {name}"), found, expected, Tolerance::relative_l2(bound));
                 println!("{what}: {name:15} {:.1e}", d.relative_l2);
             }
             let counters = &frame.splat_stats;

@@ -471,3 +471,28 @@ fn options_out_of_range_are_refused() {
     broken.camera.camera_from_world.w_axis.x = f32::NAN;
     assert!(broken.refusal(&default).is_some(), "a pose that is not finite is accepted");
 }
+
+crate::common::on_gpu!(
+    alpha_near_one_has_finite_gradients,
+    clamped_alpha_passes_no_gradient_to_opacity_and_geometry,
+    first_opaque_splat_is_blended,
+    opacity_below_the_cut_leaves_background_and_zero_gradient,
+    extreme_anisotropy_and_scale_stay_finite,
+    needles_of_1000_to_1_equal_the_reference,
+    quaternions_without_direction_are_culled,
+    quaternions_of_any_length_give_the_same_image,
+    extreme_positions_and_log_scales_are_culled_or_finite,
+    mean_at_the_camera_centre_is_culled,
+    near_plane_culls_up_to_and_including_near,
+    means_far_off_axis_are_clamped_where_the_reference_clamps_them,
+    non_finite_parameters_are_culled_and_change_nothing_else,
+    only_non_finite_gaussians_leave_background,
+    equal_depths_are_blended_in_index_order,
+    a_scene_at_one_depth_equals_the_reference,
+    order_is_exact_over_nine_decades_of_depth,
+    images_of_odd_sizes_equal_the_reference,
+    scenes_without_visible_gaussians_are_background_with_zero_gradients,
+    negative_colours_are_clamped_with_gated_gradient,
+    huge_colours_stay_finite,
+    options_out_of_range_are_refused,
+);

@@ -1,11 +1,10 @@
 //! Numerical hazards of size: many tiles, many pairs, many Gaussians on one pixel.
 
-use gazesplat_render::{Error, Splats, Termination, cpu_device, render};
+use gazesplat_render::{Error, Splats, Termination, render};
 use gazesplat_testkit::{Tolerance, assert_close};
 
-use crate::common::Scene;
-use crate::common::interleaved;
 use crate::common::scenes::{camera, empty_cloud, logit, options, push, upstream};
+use crate::common::{Scene, device, interleaved};
 
 /// More tiles than 16 bits count, in an image that is one pixel wide (or high).
 const TALL: u32 = 16 * 65_537;
@@ -46,7 +45,7 @@ fn more_pairs_than_a_gpu_buffer_indexes_are_correct_or_refused() {
         push(&mut cloud, [0.0, 0.0, 1.0 + 1e-3 * i as f32], [11.5; 3], 2.0, [0.9, 0.4, 0.1]);
     }
     let scene = Scene { cloud, camera: camera(TALL, 1, 60.0), options: options() };
-    match render(&Splats::from_cloud(&scene.cloud, &cpu_device()), &scene.camera, &scene.options) {
+    match render(&Splats::from_cloud(&scene.cloud, &device()), &scene.camera, &scene.options) {
         Ok(out) => {
             assert!(out.stats.num_pairs >= 1 << 25, "{} pairs", out.stats.num_pairs);
             let image: Vec<f32> = out.image.into_data().try_to_vec().expect("images are f32");
@@ -102,3 +101,10 @@ fn a_pile_of_faint_gaussians_equals_the_reference() {
     assert!(found.len() > 5 * 200, "most pixels are not fragile");
     assert_close("pile", &found, &expected, Tolerance::max_abs(1e-3));
 }
+
+crate::common::on_gpu!(
+    more_tiles_than_sixteen_bits_are_correct,
+    more_pairs_than_a_gpu_buffer_indexes_are_correct_or_refused,
+    a_hundred_thousand_gaussians_on_one_pixel_are_correct,
+    a_pile_of_faint_gaussians_equals_the_reference,
+);

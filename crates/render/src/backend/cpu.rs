@@ -2,10 +2,10 @@
 
 use super::host::{HostTensors, shape_of};
 use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved};
+use crate::cluster::clusters;
 use crate::error::Result;
 use crate::kernels::cpu::{
     bin::{TileGrid, TileLists, bin},
-    cluster::clusters,
     project::{GaussianSlices, ProjectedSplats, project},
     project_bwd::project_bwd,
     rasterize::{Raster, rasterize},

@@ -8,6 +8,8 @@
 
 mod autodiff;
 mod cpu;
+#[cfg(feature = "gpu")]
+mod cube;
 pub mod host;
 
 use crate::error::Result;
@@ -69,15 +71,15 @@ pub struct Saved<B: Backend> {
     pub lanes: FloatTensor<B>,
     /// Transmittance left at each pixel, `[H, W]`.
     pub final_t: FloatTensor<B>,
-    /// Gaussian of each splat, `[V]`.
+    /// Gaussian of each splat, `[V]`: ascending on the CPU, by depth on a GPU.
     pub global_from_compact: IntTensor<B>,
     /// Start of each tile's list, `[tiles + 1]`.
     pub tile_offsets: IntTensor<B>,
-    /// Splat of each pair, `[P]`.
+    /// Splat of each pair, `[P]`; on a GPU splat and record of each pair, `[P, 2]`.
     pub pair_splats: IntTensor<B>,
     /// First record of each splat, `[V + 1]`.
     pub record_offsets: IntTensor<B>,
-    /// Pair of each record, `[P]`.
+    /// Pair of each record, `[P]`; empty on a GPU, whose records lie in the order of their splats.
     pub record_pairs: IntTensor<B>,
     /// End of each tile, `[tiles]`.
     pub tile_ends: IntTensor<B>,
@@ -104,7 +106,7 @@ pub struct Backward<B: Backend> {
 }
 
 /// The renderer's operations. No default bodies: a backend without a kernel does not compile.
-#[backend_extension(NdArray, Flex: cfg(feature = "flex"), Autodiff)]
+#[backend_extension(NdArray, Flex: cfg(feature = "flex"), Cube: cfg(feature = "gpu"), Autodiff)]
 pub trait RenderOps: Backend {
     /// Draws a frame.
     fn render_forward(

@@ -45,6 +45,25 @@ pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + f32::exp(-x))
 }
 
+/// α behind the test-only smooth cut, and its derivative with respect to α.
+#[cfg_attr(feature = "gpu", derive(CubeType))]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SmoothCut {
+    /// α·h(u).
+    pub alpha: f32,
+    /// d(α·h(u))/dα.
+    pub slope: f32,
+}
+
+/// The test-only smooth cut α·h(u), u = clamp(255 α − 1, 0, 1), h(u) = u²(3 − 2u): C¹ where the cut at 1/255 jumps.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn smooth_cut(alpha: f32) -> SmoothCut {
+    let u = f32::clamp(255.0_f32 * alpha - 1.0_f32, 0.0_f32, 1.0_f32);
+    let h = u * u * (3.0_f32 - 2.0_f32 * u);
+    SmoothCut { alpha: alpha * h, slope: 255.0_f32 * alpha * (6.0_f32 * u * (1.0_f32 - u)) + h }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -6,7 +6,7 @@ use cubecl::prelude::*;
 use super::vec::{Mat2x3, Mat3, Sym2, Vec3, combine, dot, row_times};
 
 /// A camera as the kernels want it: pinhole, rigid transform, and the limits of the EWA Jacobian.
-#[cfg_attr(feature = "gpu", derive(CubeType))]
+#[cfg_attr(feature = "gpu", derive(CubeType, CubeLaunch))]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewParams {
     /// Rotation from world to camera.
@@ -148,5 +148,42 @@ pub fn projection_vjp(
     Vec3 { x: v_x, y: v_y, z: v_z }
 }
 
+/// Direction from the camera centre to a mean.
+#[cfg_attr(feature = "gpu", derive(CubeType))]
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ViewDirection {
+    /// Unit direction; (0, 0, 1) · 0 when the mean is the camera centre.
+    pub unit: Vec3,
+    /// 1 / distance, in 1 / world units.
+    pub inverse_distance: f32,
+}
+
+/// Direction in which the camera sees `mean`. The largest component is divided out first, so that far means do not
+/// overflow.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn view_direction(view: ViewParams, mean: Vec3) -> ViewDirection {
+    let x = mean.x - view.position.x;
+    let y = mean.y - view.position.y;
+    let z = mean.z - view.position.z;
+    let largest = f32::max(f32::max(f32::max(f32::abs(x), f32::abs(y)), f32::abs(z)), f32::MIN_POSITIVE);
+    let x = x / largest;
+    let y = y / largest;
+    let z = z / largest;
+    let inverse = 1.0 / f32::sqrt(x * x + y * y + z * z);
+    let inverse_distance = inverse / largest;
+    ViewDirection { unit: Vec3 { x: x * inverse, y: y * inverse, z: z * inverse }, inverse_distance }
+}
+
+/// Gradient of [`view_direction()`] with respect to the mean, for the upstream gradient `v` of the unit direction: only the
+/// part across the direction survives, divided by the distance.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn view_direction_vjp(d: ViewDirection, v: Vec3) -> Vec3 {
+    let along = v.x * d.unit.x + v.y * d.unit.y + v.z * d.unit.z;
+    let s = d.inverse_distance;
+    Vec3 { x: (v.x - along * d.unit.x) * s, y: (v.y - along * d.unit.y) * s, z: (v.z - along * d.unit.z) * s }
+}
+
 #[cfg(feature = "gpu")]
-super::copy_on_device!(ViewParamsExpand, LinearizationExpand);
+super::copy_on_device!(ViewParamsExpand, LinearizationExpand, ViewDirectionExpand);

@@ -22,6 +22,8 @@ pub mod alpha;
 pub mod conic;
 pub mod covariance;
 pub mod ewa;
+pub mod footprint;
 pub mod quat;
 pub mod sh;
+pub mod tile;
 pub mod vec;

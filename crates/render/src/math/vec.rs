@@ -4,7 +4,7 @@
 use cubecl::prelude::*;
 
 /// A vector (x, y, z).
-#[cfg_attr(feature = "gpu", derive(CubeType))]
+#[cfg_attr(feature = "gpu", derive(CubeType, CubeLaunch))]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Vec3 {
     /// First component.
@@ -16,7 +16,7 @@ pub struct Vec3 {
 }
 
 /// A 3 × 3 matrix by rows.
-#[cfg_attr(feature = "gpu", derive(CubeType))]
+#[cfg_attr(feature = "gpu", derive(CubeType, CubeLaunch))]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mat3 {
     /// First row.

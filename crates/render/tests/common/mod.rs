@@ -8,6 +8,7 @@ use gazesplat_render::{
     MeansProbe, Pass, RenderOptions, RenderStats, SplatStats, Splats, Termination, cpu_device, render, render_probed,
 };
 use gazesplat_testkit::reference;
+use std::cell::RefCell;
 
 /// What is rendered.
 #[derive(Clone)]
@@ -89,8 +90,52 @@ impl Gradients {
     }
 }
 
-/// Every CPU device of this build, with its name.
+thread_local! {
+    /// The device that this thread's scenes are rendered on, where it is not the default one.
+    static DEVICE: RefCell<Option<Device>> = const { RefCell::new(None) };
+}
+
+/// The device that scenes are rendered on: NdArray, or the GPU inside [`on_gpu!`] tests.
+pub fn device() -> Device {
+    DEVICE.with_borrow(|device| device.clone().unwrap_or_else(cpu_device))
+}
+
+/// True inside the tests that [`on_gpu!`] makes.
+pub fn is_on_gpu() -> bool {
+    gazesplat_render::is_gpu(&device())
+}
+
+/// Runs the body of a test on the GPU; skipped aloud where there is none.
+pub fn with_gpu(body: fn()) {
+    let Some(gpu) = gazesplat_testkit::devices::required_gpu(gazesplat_render::device::gpu_device(None)) else {
+        return;
+    };
+    DEVICE.set(Some(gpu));
+    body();
+    DEVICE.set(None);
+}
+
+/// Makes a second test of each body named, which renders on the GPU.
+macro_rules! on_gpu {
+    ($($body:ident),+ $(,)?) => {
+        /// The same bodies on the GPU.
+        mod on_gpu {
+            $(
+                #[test]
+                fn $body() {
+                    crate::common::with_gpu(super::$body);
+                }
+            )+
+        }
+    };
+}
+pub(crate) use on_gpu;
+
+/// Every CPU device of this build, with its name; inside [`on_gpu!`] tests the GPU alone.
 pub fn devices() -> Vec<(&'static str, Device)> {
+    if is_on_gpu() {
+        return vec![("wgpu", device())];
+    }
     let mut devices = vec![("ndarray", cpu_device())];
     if cfg!(feature = "flex") {
         #[cfg(feature = "flex")]
@@ -116,9 +161,9 @@ impl Scene {
         (self.camera.intrinsics.width * self.camera.intrinsics.height) as usize * self.channels()
     }
 
-    /// Renders on NdArray without gradients.
+    /// Renders on the [`device`] of this test, without gradients.
     pub fn frame(&self) -> Frame {
-        self.frame_on(&cpu_device())
+        self.frame_on(&device())
     }
 
     /// Renders without gradients.
@@ -128,9 +173,9 @@ impl Scene {
         self.collect(host(out.image), out.stats, out.splat_stats)
     }
 
-    /// Renders on NdArray and pulls `upstream` (as long as the image) back to the parameters.
+    /// Renders on the [`device`] of this test and pulls `upstream` (as long as the image) back to the parameters.
     pub fn frame_and_gradients(&self, upstream: &[f32]) -> (Frame, Gradients) {
-        self.frame_and_gradients_on(&cpu_device(), upstream)
+        self.frame_and_gradients_on(&device(), upstream)
     }
 
     /// Renders and pulls `upstream` (as long as the image) back to the parameters.
@@ -161,7 +206,7 @@ impl Scene {
 
     /// Why the renderer refuses these options, `None` when it does not.
     pub fn refusal(&self, options: &RenderOptions) -> Option<gazesplat_render::Error> {
-        render(&Splats::from_cloud(&self.cloud, &cpu_device()), &self.camera, options).err()
+        render(&Splats::from_cloud(&self.cloud, &device()), &self.camera, options).err()
     }
 
     fn collect(&self, image: Vec<f32>, stats: RenderStats, splat_stats: SplatStats) -> Frame {

@@ -1,19 +1,18 @@
 //! Binning: the front-to-back list of splats of every 16 × 16 tile.
 //!
-//! A (splat, tile) pair exists iff the maximum of α over the rectangle spanned by the tile's pixel centres inside the
-//! image is at least 1/255. Within one row of tiles the ellipse is convex, so the tiles it meets are consecutive and
-//! [`tile_span`] finds them from one analytic interval; counting and emitting read the same spans, so they cannot
-//! disagree.
+//! [`crate::math::tile`] defines what a pair is; counting and emitting read the same spans, so they cannot disagree.
 //!
 //! A splat's pairs are also numbered consecutively, in the order of its tiles (its records): the backward pass sums the
 //! partial gradients of a splat's pairs in that fixed order.
 
 use super::project::ProjectedSplats;
+use super::scan::exclusive_scan;
 use super::sort::depth_order;
 use crate::error::{Error, Result};
 use crate::layout::{MAX_PAIRS, TILE, lane};
 use crate::math::alpha::contour_power2;
-use crate::math::conic::{Boundary, boundary, row_span};
+use crate::math::conic::{Boundary, boundary};
+use crate::math::tile::{TileSpan, tile_span, tiles_touched};
 use crate::math::vec::Sym2;
 use crate::simd::vectorize;
 use rayon::prelude::*;
@@ -77,25 +76,17 @@ struct Entry {
     record: u32,
 }
 
-/// Indices of the tiles along one axis whose pixel centres come within [low, high]: `count` tiles, `size` pixels.
-#[expect(clippy::neg_cmp_op_on_partial_ord, reason = "the comparisons must fail for NaN")]
-#[inline(always)]
-fn tiles_touched(low: f32, high: f32, size: u32, count: u32) -> Range<u32> {
-    let tile = TILE as f32;
-    // Tile i spans the centres 16 i + ½ … min(16 i + 15½, size − ½).
-    if !(low <= size as f32 - 0.5) || !(high >= 0.5) {
-        return 0..0;
-    }
-    let first = ((low - (tile - 0.5)) / tile).ceil().max(0.0) as u32;
-    let last = ((high - 0.5) / tile).floor().max(0.0) as u32;
-    first.min(count)..(last.saturating_add(1)).min(count)
-}
-
 /// Rows of tiles the ellipse of a splat meets.
 #[inline(always)]
 fn tile_rows(splat: &[f32; lane::COUNT], grid: &TileGrid) -> Range<u32> {
     let (mean, extent) = (splat[lane::MEAN_Y], splat[lane::EXTENT_Y]);
-    tiles_touched(mean - extent, mean + extent, grid.height, grid.tiles_y)
+    indices(tiles_touched(mean - extent, mean + extent, grid.height as f32, grid.tiles_y as f32))
+}
+
+/// A span of tiles as indices.
+#[inline(always)]
+fn indices(span: TileSpan) -> Range<u32> {
+    span.first as u32..span.end as u32
 }
 
 /// The boundary of a splat's contour α = 1/255.
@@ -104,18 +95,6 @@ pub fn contour(splat: &[f32; lane::COUNT]) -> Boundary {
     let conic = Sym2 { xx: splat[lane::CONIC_XX], xy: splat[lane::CONIC_XY], yy: splat[lane::CONIC_YY] };
     let power2 = contour_power2(splat[lane::LOG2_OPACITY]);
     boundary(conic, power2, splat[lane::EXTENT_X], splat[lane::EXTENT_Y])
-}
-
-/// Tiles of row `row` that a splat with its mean at (`mean_x`, `mean_y`) meets: the one definition of a pair.
-#[inline(always)]
-pub fn tile_span(contour: Boundary, mean_x: f32, mean_y: f32, grid: &TileGrid, row: u32) -> Range<u32> {
-    let top = row as f32 * TILE as f32 + 0.5;
-    let bottom = (top + (TILE as f32 - 1.0)).min(grid.height as f32 - 0.5);
-    let span = row_span(contour, top - mean_y, bottom - mean_y);
-    if span.min > span.max {
-        return 0..0;
-    }
-    tiles_touched(mean_x + span.min, mean_x + span.max, grid.width, grid.tiles_x)
 }
 
 /// Disjoint mutable pieces of `slice` that end at the given ascending offsets.
@@ -148,8 +127,8 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
         num_entries += range.len() as u64;
         entry_offsets.push(num_entries as usize);
         let (mean, extent) = (s[lane::MEAN_X], s[lane::EXTENT_X]);
-        num_pairs_box +=
-            range.len() as u64 * tiles_touched(mean - extent, mean + extent, grid.width, grid.tiles_x).len() as u64;
+        num_pairs_box += range.len() as u64
+            * indices(tiles_touched(mean - extent, mean + extent, grid.width as f32, grid.tiles_x as f32)).len() as u64;
     }
     let limit = |needed: u64| match needed > MAX_PAIRS {
         true => Err(Error::Limit { what: "(Gaussian, tile) pairs", needed, limit: MAX_PAIRS }),
@@ -168,7 +147,15 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
                     let s = &rows[splat];
                     let contour = contour(s);
                     for (row, entry) in tile_row_ranges[splat].clone().zip(&mut entries) {
-                        let span = tile_span(contour, s[lane::MEAN_X], s[lane::MEAN_Y], &grid, row);
+                        let span = indices(tile_span(
+                            contour,
+                            s[lane::MEAN_X],
+                            s[lane::MEAN_Y],
+                            row as f32,
+                            grid.width as f32,
+                            grid.height as f32,
+                            grid.tiles_x as f32,
+                        ));
                         *entry = Entry { splat: splat as u32, first_tile: span.start, end_tile: span.end, record: 0 };
                     }
                 }
@@ -215,13 +202,7 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
     let row_lists = split_at_offsets(&mut by_row, row_ends.iter().copied());
     let counts: Vec<Vec<u32>> =
         row_lists.par_iter().map(|list| tile_counts(list, &entries, grid.tiles_x as usize)).collect();
-    let mut tile_offsets = Vec::with_capacity(grid.len() + 1);
-    tile_offsets.push(0u32);
-    let mut total = 0u32;
-    for count in counts.iter().flatten() {
-        total += count;
-        tile_offsets.push(total);
-    }
+    let tile_offsets = exclusive_scan(counts.iter().flatten().copied());
     let mut pair_splats = vec![0u32; num_pairs as usize];
     let tiles_x = grid.tiles_x as usize;
     let pair_ends = (1..=grid.tiles_y as usize).map(|r| tile_offsets[r * tiles_x] as usize);

@@ -4,15 +4,14 @@
 //! splats in row order. A Gaussian with a value that is not finite, or from which anything not finite is computed, is
 //! culled and counted. No Gaussians, or none visible, gives empty output.
 
-use super::cluster::{Cluster, Frustum};
+use crate::cluster::{Cluster, Frustum};
 use crate::layout::{ALPHA_MIN, CLUSTER, DET_MIN, EXTENT_SLACK, QUAT_NORM2_MIN, lane};
 use crate::math::alpha::{LOG2_E, contour_power2, sigmoid};
-use crate::math::conic::{Dilated, conic, dilate};
-use crate::math::covariance::factor;
-use crate::math::ewa::{Linearization, ViewParams, linearize, project_factor, to_camera};
-use crate::math::quat::{Quat, UnitQuat, normalize, rotation};
+use crate::math::ewa::{ViewParams, to_camera, view_direction};
+use crate::math::footprint::footprint;
+use crate::math::quat::Quat;
 use crate::math::sh;
-use crate::math::vec::{Mat2x3, Mat3, Sym2, Vec3};
+use crate::math::vec::Vec3;
 use crate::simd::vectorize;
 use rayon::prelude::*;
 use std::borrow::Cow;
@@ -52,6 +51,13 @@ impl GaussianSlices<'_> {
     pub(super) fn mean(&self, i: usize) -> Vec3 {
         let [x, y, z] = self.means.as_chunks::<3>().0[i];
         Vec3 { x, y, z }
+    }
+
+    /// Quaternion of Gaussian `i`.
+    #[inline(always)]
+    pub(super) fn quat(&self, i: usize) -> Quat {
+        let [w, x, y, z] = self.quats.as_chunks::<4>().0[i];
+        Quat { w, x, y, z }
     }
 
     /// Standard deviations of Gaussian `i`.
@@ -112,30 +118,6 @@ pub struct ViewSpec {
     pub near: f32,
 }
 
-/// Shape of a Gaussian in the image, with what the gradient needs again.
-pub(super) struct Footprint {
-    pub unit: UnitQuat,
-    pub rotation: Mat3,
-    pub factor: Mat3,
-    pub linearization: Linearization,
-    pub projected_factor: Mat2x3,
-    pub dilated: Dilated,
-    pub conic: Sym2,
-}
-
-/// Steps 2 to 4 of the projection: Σ' and its inverse, for a Gaussian whose mean is `in_camera`.
-#[inline(always)]
-pub(super) fn footprint(view: &ViewParams, in_camera: Vec3, quat: [f32; 4], scales: Vec3) -> Footprint {
-    let [w, x, y, z] = quat;
-    let unit = normalize(Quat { w, x, y, z });
-    let rotation = rotation(unit.q);
-    let factor = factor(rotation, scales);
-    let linearization = linearize(*view, in_camera);
-    let projected_factor = project_factor(linearization.t, factor);
-    let dilated = dilate(projected_factor);
-    Footprint { unit, rotation, factor, linearization, projected_factor, dilated, conic: conic(dilated) }
-}
-
 /// What became of one Gaussian.
 enum Outcome {
     Visible([f32; lane::COUNT]),
@@ -143,7 +125,7 @@ enum Outcome {
     NonFinite,
 }
 
-/// Projects all Gaussians; `clusters` are their bounds ([`super::cluster::clusters`]) if the caller keeps any.
+/// Projects all Gaussians; `clusters` are their bounds ([`crate::cluster::clusters`]) if the caller keeps any.
 pub fn project(g: &GaussianSlices<'_>, view: &ViewSpec, clusters: Option<&[Cluster]>) -> ProjectedSplats<'static> {
     let frustum = Frustum::new(&view.params, view.width as f32, view.height as f32, view.near);
     let parts: Vec<Part> = (0..g.len().div_ceil(CLUSTER))
@@ -229,7 +211,7 @@ fn project_one(g: &GaussianSlices<'_>, view: &ViewSpec, frustum: &Frustum, i: us
         return Outcome::Culled;
     }
     // 2.–4. Σ' = J W Σ Wᵀ Jᵀ + 0.3 I and its inverse (Zwicker 2001; Kerbl 2023, Eq. 5).
-    let fp = footprint(&view.params, in_camera, quat, scales);
+    let fp = footprint(view.params, in_camera, g.quat(i), scales);
     if fp.unit.norm * fp.unit.norm < QUAT_NORM2_MIN || fp.dilated.det <= DET_MIN {
         return Outcome::Culled;
     }
@@ -250,7 +232,7 @@ fn project_one(g: &GaussianSlices<'_>, view: &ViewSpec, frustum: &Frustum, i: us
         return Outcome::Culled;
     }
     // 6. Colour seen from the camera centre.
-    let direction = view_direction(&view.params, mean);
+    let direction = view_direction(view.params, mean);
     let mut basis = [0.0; MAX_COEFFICIENTS];
     sh_basis(g.sh_degree, direction.unit, &mut basis);
     let mut color = [0.5f32; 3];
@@ -285,26 +267,6 @@ fn project_one(g: &GaussianSlices<'_>, view: &ViewSpec, frustum: &Frustum, i: us
 
 /// SH coefficients of the highest degree.
 pub(super) const MAX_COEFFICIENTS: usize = gazesplat_core::sh::num_coefficients(gazesplat_core::sh::MAX_DEGREE);
-
-/// Direction from the camera centre to a mean.
-pub(super) struct ViewDirection {
-    /// Unit direction; (0, 0, 1) when the mean is the camera centre.
-    pub unit: Vec3,
-    /// 1 / distance.
-    pub inverse_distance: f32,
-}
-
-/// Direction in which the camera sees `mean`. The largest component is divided out first, so that far means do not
-/// overflow.
-#[inline(always)]
-pub(super) fn view_direction(view: &ViewParams, mean: Vec3) -> ViewDirection {
-    let (x, y, z) = (mean.x - view.position.x, mean.y - view.position.y, mean.z - view.position.z);
-    let largest = x.abs().max(y.abs()).max(z.abs()).max(f32::MIN_POSITIVE);
-    let (x, y, z) = (x / largest, y / largest, z / largest);
-    let inverse = 1.0 / (x * x + y * y + z * z).sqrt();
-    let inverse_distance = inverse / largest;
-    ViewDirection { unit: Vec3 { x: x * inverse, y: y * inverse, z: z * inverse }, inverse_distance }
-}
 
 /// Basis functions up to `degree` in the unit direction `d`.
 #[inline(always)]

@@ -5,18 +5,14 @@
 //! overflows is zeroed as a whole: no step along it would mean anything.
 
 use super::bin::TileLists;
-use super::project::{
-    GaussianSlices, MAX_COEFFICIENTS, ProjectedSplats, ViewDirection, ViewSpec, footprint, sh_basis, view_direction,
-};
+use super::project::{GaussianSlices, MAX_COEFFICIENTS, ProjectedSplats, ViewSpec, sh_basis};
 use super::rasterize_bwd::Record;
 use crate::layout::{CLUSTER, grad_lane, lane};
 use crate::math::alpha::sigmoid;
-use crate::math::conic::conic_vjp;
-use crate::math::covariance::factor_vjp_log_scales;
-use crate::math::ewa::{outer_vjp, project_factor_vjp_n, project_factor_vjp_t, projection_vjp, to_camera};
-use crate::math::quat::rotation_vjp;
+use crate::math::ewa::{ViewDirection, to_camera, view_direction, view_direction_vjp};
+use crate::math::footprint::{SplatGradient, footprint, footprint_vjp};
 use crate::math::sh;
-use crate::math::vec::{Mat3, Sym2, Vec3, row_times};
+use crate::math::vec::{Sym2, Vec3};
 use crate::simd::{prefetch, vectorize};
 use rayon::prelude::*;
 
@@ -157,27 +153,18 @@ fn row_gradient(
     let mean = g.mean(i);
     let in_camera = to_camera(view.params, mean);
     let scales = g.scales(i);
-    let fp = footprint(&view.params, in_camera, g.quats.as_chunks::<4>().0[i], scales);
-    // Conic → Σ' → M = T N.
-    let v_conic = Sym2 { xx: v[lane::CONIC_XX], xy: v[lane::CONIC_XY], yy: v[lane::CONIC_YY] };
-    let v_m = outer_vjp(fp.projected_factor, conic_vjp(fp.conic, v_conic));
-    // N = R S → quaternion and scales.
-    let v_n = project_factor_vjp_n(fp.linearization.t, v_m);
-    let v_log_scales = factor_vjp_log_scales(fp.rotation, scales, v_n);
-    let v_rotation = Mat3 {
-        row0: Vec3 { x: v_n.row0.x * scales.x, y: v_n.row0.y * scales.y, z: v_n.row0.z * scales.z },
-        row1: Vec3 { x: v_n.row1.x * scales.x, y: v_n.row1.y * scales.y, z: v_n.row1.z * scales.z },
-        row2: Vec3 { x: v_n.row2.x * scales.x, y: v_n.row2.y * scales.y, z: v_n.row2.z * scales.z },
+    let fp = footprint(view.params, in_camera, g.quat(i), scales);
+    let upstream = SplatGradient {
+        mean_x: v[lane::MEAN_X],
+        mean_y: v[lane::MEAN_Y],
+        depth: v[lane::DEPTH],
+        conic: Sym2 { xx: v[lane::CONIC_XX], xy: v[lane::CONIC_XY], yy: v[lane::CONIC_YY] },
     };
-    let v_quat = rotation_vjp(fp.unit, v_rotation);
-    // T = J W, mean and depth → camera space → world.
-    let v_t = project_factor_vjp_t(fp.factor, v_m);
-    let mut v_camera = projection_vjp(view.params, in_camera, fp.linearization, v_t, v[lane::MEAN_X], v[lane::MEAN_Y]);
-    v_camera.z += v[lane::DEPTH];
-    let v_mean = row_times(v_camera, view.params.rotation);
+    let geometry = footprint_vjp(view.params, fp, in_camera, scales, upstream);
+    let (v_mean, v_quat, v_log_scales) = (geometry.mean, geometry.quat, geometry.log_scales);
     // Colour: gated where it was clamped at 0.
     let v_color: [f32; 3] = std::array::from_fn(|c| if color[c] > 0.0 { v[lane::RED + c] } else { 0.0 });
-    let direction = view_direction(&view.params, mean);
+    let direction = view_direction(view.params, mean);
     let v_through_color = sh_gradient(g, i, &direction, &v_color, v_sh);
     RowGradient {
         mean: [v_mean.x + v_through_color.x, v_mean.y + v_through_color.y, v_mean.z + v_through_color.z],
@@ -222,8 +209,5 @@ fn sh_gradient(
         let [m0, m1, m2, m3, m4, m5, m6, m7, m8] = d;
         add(sh::band4_vjp(x, y, z, sh::Band4 { m0, m1, m2, m3, m4, m5, m6, m7, m8 }));
     }
-    // d = p/|p|: only the part across the direction survives, divided by the distance.
-    let along = v.x * x + v.y * y + v.z * z;
-    let s = direction.inverse_distance;
-    Vec3 { x: (v.x - along * x) * s, y: (v.y - along * y) * s, z: (v.z - along * z) * s }
+    view_direction_vjp(*direction, v)
 }

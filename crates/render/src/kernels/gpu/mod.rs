@@ -4,5 +4,12 @@
 //! [`project_bwd`]. No float is ever added atomically: every sum has a fixed order, so one adapter gives the same bits
 //! on every run. No kernel depends on the size of a subgroup.
 
+pub mod bin;
+pub mod project;
+pub mod project_bwd;
+pub mod rasterize;
+pub mod rasterize_bwd;
 pub mod scan;
 pub mod sort;
+pub mod stats;
+pub mod tile;

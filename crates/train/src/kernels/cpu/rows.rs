@@ -1,7 +1,7 @@
 //! Rows of the parameters and of both moments, added, replaced and widened together.
 
 use crate::optim::{Columns, Group};
-use gazesplat_render::kernels::cpu::cluster::morton_order;
+use gazesplat_render::cluster::morton_order;
 
 /// Parameters with the moments of their optimiser: what densification works on.
 #[derive(Debug, Clone, PartialEq)]

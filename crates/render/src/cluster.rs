@@ -5,7 +5,7 @@
 //! ([`morton_order`]). A cluster with a mean or scale that is not finite is never culled here: its rows are counted one
 //! by one. Other values of culled rows are not read, so not counted.
 
-use super::project::GaussianSlices;
+use crate::kernels::cpu::project::GaussianSlices;
 use crate::layout::CLUSTER;
 use crate::math::alpha::{LN_2, LOG2_ALPHA_MIN};
 use crate::math::conic::DILATION;

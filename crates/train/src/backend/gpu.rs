@@ -12,7 +12,7 @@ use crate::kernels::gpu::regularize::report_means;
 use crate::kernels::gpu::relocate::{PackedRows, refine};
 use crate::kernels::gpu::rows::{Listed, copied, morton_order, select_rows};
 use burn::backend::tensor::FloatTensor;
-use burn_cubecl::CubeBackend;
+use burn_cubecl::{CubeBackend, tensor::CubeTensor};
 use gazesplat_render::Result;
 use gazesplat_render::backend::Parameters;
 use gazesplat_render::gpu::{Gpu, packed::PackedLayout};
@@ -57,15 +57,8 @@ fn unmoved(rows: PackedRows) -> (PackedRows, DensifyReport) {
 }
 
 /// All three buffers, each with the rows of `new` that `listed` says.
-fn selected(
-    gpu: &Gpu,
-    rows: &PackedRows,
-    new: PackedLayout,
-    list: &burn_cubecl::tensor::CubeTensor,
-    listed: Listed,
-) -> Result<PackedRows> {
-    let select =
-        |from: &burn_cubecl::tensor::CubeTensor| select_rows(gpu, &rows.layout, from.clone(), &new, list, listed);
+fn selected(gpu: &Gpu, rows: &PackedRows, new: PackedLayout, list: &CubeTensor, listed: Listed) -> Result<PackedRows> {
+    let select = |from: &CubeTensor| select_rows(gpu, &rows.layout, from.clone(), &new, list, listed);
     Ok(PackedRows {
         params: select(&rows.params)?,
         first: select(&rows.first)?,
@@ -119,5 +112,44 @@ impl OptimOps for CubeBackend {
             let none = gpu.upload_u32(&[], &[0]);
             selected(gpu, &rows, new, &none, Listed::Copied).map(unmoved)
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::backend::Status;
+    use crate::config::OptimSection;
+    use crate::optim::{AdamSettings, LearningRates, Regularizers};
+    use burn::tensor::DType;
+    use gazesplat_render::device::gpu_device;
+    use gazesplat_testkit::devices::required_gpu;
+
+    #[test]
+    fn an_update_writes_where_the_values_are_unless_they_are_shared() {
+        let Some(gpu) = required_gpu(gpu_device(None)).and_then(|device| Gpu::from_device(&device)) else { return };
+        let layout = PackedLayout::new(100, 4);
+        let zeros = || {
+            let whole = gpu.zeros("bytes of a test", &[layout.len()], DType::F32).expect("it fits");
+            layout.views(&whole)
+        };
+        let status = gpu.upload_u32(&Status::default().to_words(), &[Status::NUM_WORDS]);
+        let state = State { params: zeros(), first: zeros(), second: zeros(), status };
+        let is_same =
+            |a: &GpuParameters, b: &GpuParameters| a.sh.handle.memory.descriptor() == b.sh.handle.memory.descriptor();
+        let update = AdamUpdate {
+            number: 1,
+            settings: AdamSettings::default(),
+            rates: LearningRates::at(&OptimSection::default(), 0, 10, 1.0),
+            regularizers: Regularizers::default(),
+            report: false,
+        };
+        for shared in [false, true] {
+            let loss = gpu.zeros("bytes of a test", &[1], DType::F32).expect("it fits");
+            let Changed { state: after, outcome } = CubeBackend::adam(state.clone(), zeros(), loss, update, shared);
+            outcome.expect("it fits");
+            assert_eq!(is_same(&after.params, &state.params), !shared);
+            assert!(is_same(&after.first, &state.first) && is_same(&after.second, &state.second));
+        }
     }
 }

@@ -44,7 +44,7 @@ impl Rows {
         }
     }
 
-    /// Puts row `order[i]` at place i, in parameters and moments.
+    /// Puts row `order[i]` at place i, in parameters and moments; rows that `order` leaves out are gone.
     ///
     /// # Panics
     /// If `order` names something that is not a row.

@@ -60,8 +60,8 @@ fn survey(gpu: &Gpu, rows: &PackedRows, refinement: &Refinement) -> Result<Surve
     let n = rows.layout.num_rows;
     let [weights, is_dead, is_broken] = [0; 3].map(|_| gpu.empty("bytes of a survey", &[n], DType::U32));
     let (weights, is_dead, is_broken) = (weights?, is_dead?, is_broken?);
-    // Rounding up adds less than one a row.
-    let scale = (u32::MAX / n as u32).saturating_sub(1).clamp(1, MAX_WEIGHT);
+    // No row weighs more than this, so that the sum fits 32 bits.
+    let scale = (u32::MAX / n as u32).min(MAX_WEIGHT);
     let [x, y, z] = refinement.center;
     weigh_rows::launch(
         &gpu.client,

@@ -55,7 +55,7 @@ fn in_legs(
         if outcome == Outcome::Finished || stop.load(Ordering::Relaxed) {
             return Ok(outcome);
         }
-        *kept = Some(Kept { step: trainer.step_index(), cloud: trainer.to_cloud() });
+        *kept = Some(Kept { step: trainer.step_index(), cloud: trainer.to_cloud()? });
         pause.store(false, Ordering::Relaxed);
     }
 }
@@ -159,7 +159,7 @@ mod tests {
         let outcome = in_legs(&mut trainer, &mut [&mut legs], &never, &mut kept).expect("trains");
         assert_eq!(outcome, Outcome::Finished);
         assert_eq!(legs.told, whole.told);
-        assert_eq!(trainer.to_cloud(), reference.to_cloud());
+        assert_eq!(trainer.to_cloud().expect("readable"), reference.to_cloud().expect("readable"));
         assert!(kept.is_some());
     }
 

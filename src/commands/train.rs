@@ -170,7 +170,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     durations.push(("training".to_owned(), train_secs));
     let num_steps = trainer.step_index();
     // A lost GPU takes the model with it; what a person waited for is then the last copy.
-    let latest = job.device.guard(|| Ok(trainer.to_cloud()));
+    let latest = job.device.guard(|| Ok(trainer.to_cloud()?));
     let (outcome, cloud) = match (ended, latest) {
         (Ok(outcome), Ok(cloud)) => (outcome, cloud),
         (Err(failure), Ok(cloud)) if !cloud.is_empty() => {
@@ -185,7 +185,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let started = Instant::now();
     let options = config.render_options();
-    let splats = Splats::from_cloud(&cloud, job.device.tensors());
+    let splats = Splats::from_cloud(&cloud, job.device.tensors())?;
     let eval = match recorder.take_evaluation(num_steps) {
         // The run has just measured this very model.
         Some(eval) if eval.num_gaussians == cloud.len() => eval,

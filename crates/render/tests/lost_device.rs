@@ -10,7 +10,7 @@ fn lose() {
     // A device of its own on the default adapter: the one that the other tests share has to live.
     let (device, setup) = Device::wgpu_options().init_with_setup().expect("the adapter opens twice");
     let scene = random(3, Draw::default());
-    let splats = Splats::from_cloud(&scene.cloud, &device);
+    let splats = Splats::from_cloud(&scene.cloud, &device).expect("it fits");
     render(&splats, &scene.camera, &scene.options).expect("the adapter is still there");
     setup.device.destroy();
     for _ in 0..2 {

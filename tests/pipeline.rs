@@ -57,7 +57,8 @@ fn synthetic_scene_is_learned_and_the_model_renders_as_measured() {
     assert_eq!(cloud, trained.cloud);
     let splats = Splats::from_cloud(&cloud, &cpu_device());
     let view = &trained.dataset.test[0];
-    let image = rgb(render(&splats, &view.camera, &RenderOptions::default()).expect("renders")).to_rgb8();
+    let image =
+        rgb(render(&splats, &view.camera, &RenderOptions::default()).expect("renders")).expect("reads").to_rgb8();
     let photograph = images::load_view_image(view).expect("decodes").image;
     let (psnr, _) = difference(&image, &photograph);
     // Rounding the render to 8 bits is all that differs from the measurement in floats.
@@ -91,7 +92,7 @@ fn reference_renders_of_a_real_model_are_matched() {
     let views = dataset.all_views();
     assert_eq!(views.len(), 24);
     for view in views {
-        let image = rgb(render(&splats, &view.camera, &options).expect("renders")).to_rgb8();
+        let image = rgb(render(&splats, &view.camera, &options).expect("renders")).expect("reads").to_rgb8();
         let reference = images::load_view_image(view).expect("decodes").image;
         let (psnr, share_off) = difference(&image, &reference);
         assert!(psnr >= 55.0, "{}: {psnr:.2} dB", view.name);

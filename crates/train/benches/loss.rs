@@ -1,7 +1,7 @@
 //! The fused L1 + SSIM loss with its gradient, by image size.
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
-use gazesplat_train::losses::ssim_kernel::{Comparison, Weights, similarity, similarity_and_gradient};
+use gazesplat_train::kernels::cpu::l1_ssim::{Comparison, Weights, similarity, similarity_and_gradient};
 use std::hint::black_box;
 
 fn loss(c: &mut Criterion) {

@@ -2,7 +2,7 @@
 
 use gazesplat_render::simd::SimdLevel;
 use gazesplat_testkit::golden;
-use gazesplat_train::losses::ssim_kernel::{Comparison, Weights, similarity, similarity_and_gradient};
+use gazesplat_train::kernels::cpu::l1_ssim::{Comparison, Weights, similarity, similarity_and_gradient};
 use gazesplat_train::optim::adam::{AdamSettings, Step, update};
 
 /// f32 arithmetic on images of up to 56 × 40: the sums themselves are exact to about 1e-7.

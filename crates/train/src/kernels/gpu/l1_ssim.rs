@@ -28,6 +28,15 @@ const WINDOWED: usize = TILE * HALO;
 /// Units, as a length.
 const NUM_UNITS: usize = UNITS as usize;
 
+/// How a target is stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum TargetFormat {
+    /// `[height, width]`: red, green, blue from the lowest byte on, the highest byte 0 = the pixel carries no loss.
+    Bytes,
+    /// `[height, width, 3]`: the bits of f32 on the scale 0..1, no mask.
+    Floats,
+}
+
 /// An image and what it is compared with.
 #[derive(Debug, Clone)]
 pub struct Comparison {
@@ -39,9 +48,11 @@ pub struct Comparison {
     pub channels: usize,
     /// `[height, width, channels]` of f32, contiguous.
     pub image: CubeTensor,
-    /// `[height, width]` of u32: red, green, blue from the lowest byte on, the highest byte 0 = the pixel carries no loss.
+    /// Words of u32, contiguous.
     pub target: CubeTensor,
-    /// Pixels whose highest byte is not 0.
+    /// What the words are.
+    pub format: TargetFormat,
+    /// Pixels that carry loss.
     pub num_pixels: usize,
 }
 
@@ -97,6 +108,7 @@ pub fn similarity_and_gradient(
         channels as u32,
         l1 * norm,
         ssim * norm,
+        comparison.format,
     );
     Ok((run_packed(gpu, comparison, &sums, ssim_weight)?, v_image))
 }
@@ -151,6 +163,7 @@ fn run_ssim_pass(gpu: &Gpu, comparison: &Comparison, maps: &[CubeTensor; 3], wit
         comparison.height as u32,
         comparison.channels as u32,
         num_tiles as u32,
+        comparison.format,
         with_maps,
     );
     Ok(sums)
@@ -190,15 +203,20 @@ fn place_of(column: usize, row: usize, width: u32, height: u32) -> Place {
     Place { pixel, in_image }
 }
 
-/// A component of a target colour on the scale 0..1.
+/// A component of the target's colour on the scale 0..1.
 #[cube]
-fn unit_value(word: u32, channel: u32) -> f32 {
-    f32::cast_from((word >> (8 * channel)) & 0xffu32) * (1.0_f32 / 255.0_f32)
+fn target_value(target: &[u32], pixel: usize, channel: u32, #[comptime] format: TargetFormat) -> f32 {
+    if comptime![format == TargetFormat::Floats] {
+        f32::reinterpret(target[pixel * 3 + channel as usize])
+    } else {
+        f32::cast_from((target[pixel] >> (8 * channel)) & 0xffu32) * (1.0_f32 / 255.0_f32)
+    }
 }
 
+/// True if the pixel carries no loss.
 #[cube]
-fn is_masked(word: u32) -> bool {
-    (word >> 24u32) == 0u32
+fn is_masked(target: &[u32], pixel: usize, #[comptime] format: TargetFormat) -> bool {
+    if comptime![format == TargetFormat::Floats] { false.runtime() } else { (target[pixel] >> 24u32) == 0u32 }
 }
 
 /// Sum over the units of a workgroup, by halves; every unit must call it. `shared` holds one value per unit.
@@ -232,6 +250,7 @@ fn ssim_pass(
     height: u32,
     channels: u32,
     num_tiles: u32,
+    #[comptime] format: TargetFormat,
     #[comptime] with_maps: bool,
 ) {
     let mut raw_x = Shared::<[f32]>::new_slice(REACHED);
@@ -242,7 +261,7 @@ fn ssim_pass(
     let own = place_of(column + RADIUS, row + RADIUS, width, height);
     let mut is_valid = own.in_image;
     if own.in_image {
-        is_valid = !is_masked(target[own.pixel]);
+        is_valid = !is_masked(target, own.pixel, format);
     }
     let mut l1_sum = 0.0_f32;
     let mut ssim_sum = 0.0_f32;
@@ -254,10 +273,9 @@ fn ssim_pass(
             let mut x = 0.0_f32;
             let mut y = 0.0_f32;
             if place.in_image {
-                let word = target[place.pixel];
-                y = unit_value(word, channel);
+                y = target_value(target, place.pixel, channel, format);
                 x = y;
-                if !is_masked(word) {
+                if !is_masked(target, place.pixel, format) {
                     x = image[place.pixel * channels as usize + channel as usize];
                 }
             }
@@ -359,6 +377,7 @@ fn gradient_pass(
     channels: u32,
     l1_weight: f32,
     ssim_weight: f32,
+    #[comptime] format: TargetFormat,
 ) {
     let mut maps = Shared::<[f32]>::new_slice(3 * REACHED);
     let mut blurred = Shared::<[f32]>::new_slice(3 * WINDOWED);
@@ -418,12 +437,11 @@ fn gradient_pass(
             p += w * blurred[2 * WINDOWED + i];
         }
         if own.in_image {
-            let word = target[own.pixel];
             let to = own.pixel * channels as usize + channel as usize;
             let mut v = 0.0_f32;
-            if !is_masked(word) {
+            if !is_masked(target, own.pixel, format) {
                 let x = image[to];
-                let y = unit_value(word, channel);
+                let y = target_value(target, own.pixel, channel, format);
                 // torch's sign: 0 at equality.
                 if x > y {
                     v = l1_weight;

@@ -1,7 +1,7 @@
 //! The loss on a GPU: the photograph goes up as one word per pixel, nothing comes back.
 
 use super::{LossGradientOps, LossOps, LossTarget};
-use crate::kernels::gpu::l1_ssim::{Comparison, scaled, similarity, similarity_and_gradient};
+use crate::kernels::gpu::l1_ssim::{Comparison, TargetFormat, scaled, similarity, similarity_and_gradient};
 use burn::backend::tensor::FloatTensor;
 use burn_cubecl::CubeBackend;
 use gazesplat_render::gpu::{Gpu, contiguous};
@@ -44,7 +44,7 @@ fn comparison(image: FloatTensor<CubeBackend>, target: &LossTarget) -> (Gpu, Com
     let gpu = Gpu::of(&image);
     let (words, num_pixels) = packed_target(target);
     let target = gpu.upload_u32(&words, &[height, width]);
-    (gpu, Comparison { width, height, channels, image, target, num_pixels })
+    (gpu, Comparison { width, height, channels, image, target, format: TargetFormat::Bytes, num_pixels })
 }
 
 /// One word per pixel, red in the lowest byte, the highest 255 where the pixel carries loss, else 0; and how many carry it.

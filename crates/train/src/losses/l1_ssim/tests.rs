@@ -127,6 +127,18 @@ fn gpu_equals_cpu_in_value_and_gradient() {
     }
 }
 
+/// 65,538 tiles, more than one axis of a dispatch has: every tile of the last column of dispatches must be found.
+#[test]
+fn more_tiles_than_one_axis_of_a_dispatch() {
+    let Some(gpu) = gpu() else { return };
+    let case = (16 * 65_537 + 1, 1, false);
+    let losses = losses(1.0, 0.2);
+    let [expected, found] = [gazesplat_render::cpu_device(), gpu].map(|device| evaluated(&device, case, 4, &losses));
+    assert!((expected.report.total - found.report.total).abs() <= VALUE_TOLERANCE, "{:?}", found.report);
+    let worst = farthest(&expected.v_image, &found.v_image);
+    assert!(worst <= GRADIENT_TOLERANCE * largest(&expected.v_image), "{worst}");
+}
+
 #[test]
 fn two_runs_on_the_gpu_give_the_same_bits() {
     let Some(gpu) = gpu() else { return };

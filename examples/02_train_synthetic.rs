@@ -21,7 +21,9 @@ impl Observer for Teller {
     fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn Error + Send + Sync>> {
         match event {
             TrainEvent::Step(report) if report.step.is_multiple_of(100) => {
-                eprintln!("step {}: loss {:.4}, {} Gaussians", report.step, report.loss, report.num_gaussians);
+                // Every tenth step has its losses on any device; a GPU is not asked for those between.
+                let loss = report.losses.as_ref().map_or(f32::NAN, |losses| losses.total);
+                eprintln!("step {}: loss {loss:.4}, {} Gaussians", report.step, report.num_gaussians);
             }
             TrainEvent::Evaluated { step, report } => eprintln!("step {step}: {:.2} dB on test views", report.psnr),
             _ => {}

@@ -1,5 +1,6 @@
 //! The whole way through the library: scene, training, measurement, rendering; and real captures when they are at hand.
 
+use gazesplat::commands::device::ComputeDevice;
 use gazesplat::commands::train::{TrainJob, Trained, train};
 use gazesplat::{Console, Settings};
 use gazesplat_core::dataset::LoadOptions;
@@ -17,7 +18,8 @@ use std::sync::atomic::AtomicBool;
 fn run(scene: &Path, out: &Path, overrides: &[&str]) -> Trained {
     let overrides: Vec<String> = overrides.iter().map(|&o| o.to_owned()).collect();
     let config = Settings::new().with_overrides(&overrides).and_then(|s| s.resolve()).expect("valid settings");
-    let job = TrainJob { scene, config, out: Some(out), overwrite: false };
+    let device = &ComputeDevice::cpu();
+    let job = TrainJob { scene, config, out: Some(out), overwrite: false, device };
     train(&job, &AtomicBool::new(false), &Console::quiet()).expect("training works")
 }
 
@@ -57,7 +59,8 @@ fn synthetic_scene_is_learned_and_the_model_renders_as_measured() {
     assert_eq!(cloud, trained.cloud);
     let splats = Splats::from_cloud(&cloud, &cpu_device());
     let view = &trained.dataset.test[0];
-    let image = rgb(render(&splats, &view.camera, &RenderOptions::default()).expect("renders")).to_rgb8();
+    let image =
+        rgb(render(&splats, &view.camera, &RenderOptions::default()).expect("renders")).expect("reads").to_rgb8();
     let photograph = images::load_view_image(view).expect("decodes").image;
     let (psnr, _) = difference(&image, &photograph);
     // Rounding the render to 8 bits is all that differs from the measurement in floats.
@@ -91,7 +94,7 @@ fn reference_renders_of_a_real_model_are_matched() {
     let views = dataset.all_views();
     assert_eq!(views.len(), 24);
     for view in views {
-        let image = rgb(render(&splats, &view.camera, &options).expect("renders")).to_rgb8();
+        let image = rgb(render(&splats, &view.camera, &options).expect("renders")).expect("reads").to_rgb8();
         let reference = images::load_view_image(view).expect("decodes").image;
         let (psnr, share_off) = difference(&image, &reference);
         assert!(psnr >= 55.0, "{}: {psnr:.2} dB", view.name);

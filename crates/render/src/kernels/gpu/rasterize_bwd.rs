@@ -1,6 +1,6 @@
 //! Gradient of the rasterisation: every tile walks its list back to front.
 //!
-//! One workgroup per tile, in batches of [`BATCH`] splats and two phases. In the first a unit is a pixel: it steps its
+//! One workgroup per tile, in batches of eight splats and two phases. In the first a unit is a pixel: it steps its
 //! transmittance T in front of each splat, and the scalar R·v of what lies behind (renderer.md §3): nothing is subtracted
 //! from a sum, so no digits are lost where 1 − α is small. It leaves v = ∂L/∂power and the weight T α of every splat of the
 //! batch in workgroup memory. In the second, 32 units per splat reduce these to six moments of v, from which mean, conic

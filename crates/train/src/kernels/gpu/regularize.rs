@@ -27,11 +27,11 @@ pub fn scale_gradient(log_scale: f32, factor: f32) -> f32 {
     factor * f32::exp(log_scale)
 }
 
-/// Puts the mean opacity and the mean scale into the status.
+/// Puts the mean opacity and the mean scale into the status; the gradients are Adam's to add.
 ///
 /// # Errors
 /// [`gazesplat_render::Error::Limit`] never in practice: the sums take two kilobytes.
-pub fn report_means(gpu: &Gpu, layout: &PackedLayout, params: &CubeTensor, status: &CubeTensor) -> Result<()> {
+pub fn regularize(gpu: &Gpu, layout: &PackedLayout, params: &CubeTensor, status: &CubeTensor) -> Result<()> {
     let sums = gpu.empty("bytes of sums", &[2 * NUM_SUMS as usize], DType::F32)?;
     sum_values::launch(
         &gpu.client,

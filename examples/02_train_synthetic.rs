@@ -21,7 +21,7 @@ impl Observer for Teller {
     fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn Error + Send + Sync>> {
         match event {
             TrainEvent::Step(report) if report.step.is_multiple_of(100) => {
-                // Every tenth step has its losses on any device; a GPU is not asked for those between.
+                // On a GPU the losses are read back for logged steps only.
                 let loss = report.losses.as_ref().map_or(f32::NAN, |losses| losses.total);
                 eprintln!("step {}: loss {loss:.4}, {} Gaussians", report.step, report.num_gaussians);
             }

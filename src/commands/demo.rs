@@ -199,7 +199,7 @@ fn write_orbit(
     let path = CameraPath::through(&keys, num_frames, true)?;
     path.save(out.join("orbit.json"))?;
     let file = out.join("orbit.y4m");
-    let splats = Splats::from_cloud(&trained.cloud, job.device.tensors());
+    let splats = Splats::from_cloud(&trained.cloud, job.device.tensors())?;
     let options = job.config.render_options();
     let bar = progress::counting_bar(console, "rendering", path.frames.len());
     let mut film = Vec::new();

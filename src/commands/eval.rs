@@ -65,7 +65,7 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
     let report = with_threads(config.train.threads, || {
         log_machine();
-        let splats = Splats::from_cloud(&model.cloud, device.tensors());
+        let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
         quality::measure(&splats, &images, &config.render_options(), console)
     })??;
     tracing::info!("images in memory: {} of {}", bytes(images.num_bytes() as u64), images.len());

@@ -159,7 +159,7 @@ mod tests {
         let outcome = in_legs(&mut trainer, &mut [&mut legs], &never, &mut kept).expect("trains");
         assert_eq!(outcome, Outcome::Finished);
         assert_eq!(legs.told, whole.told);
-        assert_eq!(trainer.to_cloud().expect("reads"), reference.to_cloud().expect("reads"));
+        assert_eq!(trainer.to_cloud().expect("readable"), reference.to_cloud().expect("readable"));
         assert!(kept.is_some());
     }
 

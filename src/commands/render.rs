@@ -112,7 +112,7 @@ fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &
         camera.intrinsics = replaced(camera.intrinsics, args.size, args.fov);
     }
 
-    let splats = Splats::from_cloud(&model.cloud, device.tensors());
+    let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
     let bar = progress::counting_bar(console, "rendering", cameras.len());
     let started = Instant::now();
     let mut stats: Vec<(String, RenderStats)> = Vec::new();

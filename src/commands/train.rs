@@ -185,7 +185,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let started = Instant::now();
     let options = config.render_options();
-    let splats = Splats::from_cloud(&cloud, job.device.tensors());
+    let splats = Splats::from_cloud(&cloud, job.device.tensors())?;
     let eval = match recorder.take_evaluation(num_steps) {
         // The run has just measured this very model.
         Some(eval) if eval.num_gaussians == cloud.len() => eval,

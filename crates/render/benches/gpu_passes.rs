@@ -91,7 +91,7 @@ fn gpu_passes(c: &mut Criterion) {
             println!("SKIPPED on a software driver: {num} Gaussians");
             continue;
         }
-        let splats = Splats::from_cloud(&bench_cloud(num, 1), &device);
+        let splats = Splats::from_cloud(&bench_cloud(num, 1), &device).expect("it fits");
         let camera = bench_camera(1920, 1080);
         group.bench_function(format!("{num} Gaussians"), |b| {
             b.iter(|| {

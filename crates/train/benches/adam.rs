@@ -14,7 +14,7 @@ fn adam(c: &mut Criterion) {
         for num_gaussians in [60_000usize, 300_000] {
             let widths = [3, 4, 3, 1, 48];
             let rows = |value| Columns { data: widths.map(|w| vec![value; w * num_gaussians]), widths };
-            let mut state = ModelState::new(rows(0.1), AdamSettings::default(), &device);
+            let mut state = ModelState::new(rows(0.1), AdamSettings::default(), &device).expect("it fits");
             let mut gradients = gradients(rows(1e-3), &device);
             group.throughput(Throughput::Elements(num_gaussians as u64));
             group.bench_function(BenchmarkId::new(name, num_gaussians), |b| {
@@ -38,7 +38,7 @@ fn update(state: &mut ModelState, gradients: Splats) {
 fn gradients(rows: Columns, device: &Device) -> impl FnMut() -> Splats + use<> {
     let device = device.clone();
     let packed = is_gpu(&device).then(|| {
-        let mut state = ModelState::new(rows.clone(), AdamSettings::default(), &device);
+        let mut state = ModelState::new(rows.clone(), AdamSettings::default(), &device).expect("it fits");
         update(&mut state, rows.zeros_like().into_splats(&device));
         state.splats()
     });

@@ -3,6 +3,10 @@
 //!
 //! Philox4x32-10 (Salmon 2011, "Parallel random numbers: as easy as 1, 2, 3").
 
+#[cfg(feature = "gpu")]
+#[expect(missing_docs, reason = "what the kernel macros generate carries no documentation")]
+pub mod gpu;
+
 pub use crate::math::uniform;
 
 use crate::math;

@@ -88,7 +88,7 @@ impl Trainer {
             test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
             config: config.clone(),
             images,
-            state: ModelState::new(rows.params, AdamSettings::default(), device),
+            state: ModelState::new(rows.params, AdamSettings::default(), device)?,
             strategy,
             sorted_at: 0,
             losses,

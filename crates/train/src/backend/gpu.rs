@@ -8,7 +8,7 @@ use super::{AdamUpdate, Changed, NoiseUpdate, OptimOps, Refinement, State};
 use crate::event::DensifyReport;
 use crate::kernels::gpu::adam::{self, Packed};
 use crate::kernels::gpu::noise::add_noise;
-use crate::kernels::gpu::regularize::report_means;
+use crate::kernels::gpu::regularize::regularize;
 use crate::kernels::gpu::relocate::{PackedRows, refine};
 use crate::kernels::gpu::rows::{Listed, copied, morton_order, select_rows};
 use burn::backend::tensor::FloatTensor;
@@ -79,7 +79,7 @@ impl OptimOps for CubeBackend {
             let (_, grads) = PackedLayout::pack(gpu, gradients)?;
             adam::watch(gpu, loss, &state.status, update.number);
             if update.report {
-                report_means(gpu, &rows.layout, &rows.params, &state.status)?;
+                regularize(gpu, &rows.layout, &rows.params, &state.status)?;
             }
             let PackedRows { layout, params, first, second } = &rows;
             let packed = Packed { params, grads: &grads, first, second };

@@ -8,6 +8,8 @@ use burn::backend::Dispatch;
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use gazesplat_render::Splats;
 use gazesplat_render::backend::Parameters;
+#[cfg(feature = "gpu")]
+use gazesplat_render::gpu::packed::PackedLayout;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Parameters and their optimiser, changed by one operation at a time.
@@ -26,7 +28,15 @@ pub struct ModelState {
 
 impl ModelState {
     /// The parameters `params` on `device`, with zero moments.
-    pub fn new(params: Columns, settings: AdamSettings, device: &Device) -> Self {
+    ///
+    /// # Errors
+    /// [`crate::Error::Render`] when a GPU takes no model of that size.
+    pub fn new(params: Columns, settings: AdamSettings, device: &Device) -> Result<Self> {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = gazesplat_render::gpu::Gpu::from_device(device) {
+            let layout = PackedLayout::new(params.num_rows(), params.num_coefficients());
+            gpu.check_size("bytes of packed parameters", &[layout.len()], DType::F32)?;
+        }
         let zeros = || dispatched(params.zeros_like().into_splats(device));
         let tensors = State {
             first: zeros(),
@@ -34,13 +44,13 @@ impl ModelState {
             status: status_tensor(Status::default(), device),
             params: dispatched(params.into_splats(device)),
         };
-        Self {
+        Ok(Self {
             tensors: Some(tensors),
             settings,
             num_updates: 0,
             is_handed_out: AtomicBool::new(false),
             device: device.clone(),
-        }
+        })
     }
 
     fn tensors(&self) -> &State<Dispatch> {
@@ -94,7 +104,8 @@ impl ModelState {
     pub fn status(&self) -> Result<Status> {
         let words = Tensor::<1, Int>::from_dispatch(self.tensors().status.clone());
         let data = words.try_into_data().map_err(|e| gazesplat_render::Error::device(&e))?;
-        let words: Vec<i32> = data.try_into_vec().expect("a status is made of 32-bit words");
+        // A GPU copies on the first access: that can fail, too.
+        let words: Vec<i32> = data.try_into_vec().map_err(|e| gazesplat_render::Error::device(&e))?;
         Ok(Status::from_words(std::array::from_fn(|i| words[i].cast_unsigned())))
     }
 

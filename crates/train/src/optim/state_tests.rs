@@ -32,7 +32,7 @@ fn of_opacities(opacities: &[f32]) -> Columns {
 }
 
 fn model(params: &Columns, device: &Device) -> ModelState {
-    ModelState::new(params.clone(), AdamSettings::default(), device)
+    ModelState::new(params.clone(), AdamSettings::default(), device).expect("it fits")
 }
 
 fn params(state: &ModelState) -> Columns {

@@ -14,7 +14,7 @@ use super::bin::TileLists;
 use super::rasterize::{Raster, alpha_at};
 use super::tile::{STAGED, TileArgs, pixel, stage, staged_splat, tile_args};
 use crate::error::Result;
-use crate::gpu::{Gpu, UNITS, cube_dim};
+use crate::gpu::{Gpu, SHARED_BYTES, UNITS, cube_dim};
 use crate::kernels::cpu::rasterize::RasterOptions;
 use crate::layout::{TILE, grad_lane, lane};
 use crate::math::alpha::LN_2;
@@ -29,6 +29,10 @@ const UNITS_PER_SPLAT: usize = UNITS as usize / BATCH;
 /// Pixels that one of them looks at: the same column in every other row.
 const PIXELS_PER_UNIT: usize = BATCH;
 const _: () = assert!(UNITS_PER_SPLAT == 2 * TILE, "a unit keeps its column");
+const _: () = assert!(
+    4 * (STAGED * BATCH + (2 * BATCH + 4) * UNITS as usize + 1) <= SHARED_BYTES,
+    "adapters are asked for less workgroup memory than this kernel takes"
+);
 
 /// Guard of 1 − α before it divides.
 const ONE_MINUS_ALPHA_MIN: f32 = 1e-6;

@@ -108,7 +108,7 @@ impl Rows {
 ///
 /// # Panics
 /// If `new` is smaller than `old`.
-pub fn widened(values: &[f32], old: usize, new: usize) -> Vec<f32> {
+fn widened(values: &[f32], old: usize, new: usize) -> Vec<f32> {
     assert!(new >= old, "rows of {old} values cannot be widened to {new}");
     let mut wide = vec![0.0; values.len() / old * new];
     for (to, from) in wide.chunks_exact_mut(new).zip(values.chunks_exact(old)) {

@@ -5,5 +5,4 @@ pub mod l1_ssim;
 pub mod noise;
 pub mod regularize;
 pub mod relocate;
-pub mod rng;
 pub mod rows;

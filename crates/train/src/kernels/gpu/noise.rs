@@ -3,11 +3,11 @@
 //! One unit per row reads its parameters and overwrites its mean: the caller owns them. Coordinates that would not be
 //! finite are left alone, and so is everything while the status is closed.
 
-use super::rng::{Draws, DrawsLaunch, draw};
 use super::rows::{Sections, SectionsLaunch};
 use crate::backend::NoiseUpdate;
 use crate::math::{covariance_times, gate, logit_limit, normals};
 use crate::rng::Stream;
+use crate::rng::gpu::{Draws, DrawsLaunch, draw};
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 use gazesplat_render::gpu::device_fn::is_finite;

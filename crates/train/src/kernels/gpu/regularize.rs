@@ -27,11 +27,11 @@ pub fn scale_gradient(log_scale: f32, factor: f32) -> f32 {
     factor * f32::exp(log_scale)
 }
 
-/// Puts the mean opacity and the mean scale into the status.
+/// Puts the mean opacity and the mean scale into the status; the gradients are Adam's to add.
 ///
 /// # Errors
 /// [`gazesplat_render::Error::Limit`] never in practice: the sums take two kilobytes.
-pub fn report_means(gpu: &Gpu, layout: &PackedLayout, params: &CubeTensor, status: &CubeTensor) -> Result<()> {
+pub fn regularize(gpu: &Gpu, layout: &PackedLayout, params: &CubeTensor, status: &CubeTensor) -> Result<()> {
     let sums = gpu.empty("bytes of sums", &[2 * NUM_SUMS as usize], DType::F32)?;
     sum_values::launch(
         &gpu.client,
@@ -54,25 +54,23 @@ pub fn report_means(gpu: &Gpu, layout: &PackedLayout, params: &CubeTensor, statu
     Ok(())
 }
 
-/// Sum of one value per unit of a workgroup, as a tree, in `shared` of [`UNITS`] values. Every unit
-/// must call it.
+/// Sum of one value per unit of a workgroup, as a tree, into the first of the [`UNITS`] values of `shared`. Every unit must
+/// call it.
 #[cube]
-fn sum_units(shared: &mut Shared<[f32]>, value: f32) -> f32 {
+fn sum_units(shared: &mut Shared<[f32]>, value: f32) {
     let unit = UNIT_POS as usize;
     sync_cube();
     shared[unit] = value;
     sync_cube();
     let mut distance = 1usize;
     while distance < UNITS as usize {
-        if unit % (2 * distance) == 0 {
+        if unit & (2 * distance - 1) == 0 {
             let other = shared[unit + distance];
             shared[unit] += other;
         }
         sync_cube();
         distance *= 2;
     }
-    let sum = shared[0];
-    sum
 }
 
 #[cube(launch)]
@@ -90,8 +88,10 @@ fn sum_values(params: &[f32], sums: &mut [f32], at: Sections) {
             i += NUM_SUMS * UNITS;
         }
     }
-    let opacity = sum_units(&mut shared, opacities);
-    let scale = sum_units(&mut shared, scales);
+    sum_units(&mut shared, opacities);
+    let opacity = shared[0];
+    sum_units(&mut shared, scales);
+    let scale = shared[0];
     if UNIT_POS == 0u32 && CUBE_POS < NUM_SUMS as usize {
         sums[CUBE_POS] = opacity;
         sums[CUBE_POS + NUM_SUMS as usize] = scale;
@@ -101,8 +101,10 @@ fn sum_values(params: &[f32], sums: &mut [f32], at: Sections) {
 #[cube(launch)]
 fn finish(sums: &[f32], status: &mut [u32], per_row: f32, per_scale: f32) {
     let mut shared = Shared::<[f32]>::new_slice(UNITS as usize);
-    let opacity = sum_units(&mut shared, sums[UNIT_POS as usize]);
-    let scale = sum_units(&mut shared, sums[UNIT_POS as usize + NUM_SUMS as usize]);
+    sum_units(&mut shared, sums[UNIT_POS as usize]);
+    let opacity = shared[0];
+    sum_units(&mut shared, sums[UNIT_POS as usize + NUM_SUMS as usize]);
+    let scale = shared[0];
     if ABSOLUTE_POS == 0 {
         status[2] = u32::reinterpret(opacity * per_row);
         status[3] = u32::reinterpret(scale * per_scale);

@@ -10,13 +10,13 @@
 //! of additions: a Gaussian on the threshold of death among a million has a weight of some twenty, one of three hundred
 //! thousand of some seventy. One read-back of four words tells the host how many rows are dead.
 
-use super::rng::{Draws, DrawsLaunch, draw};
 use super::rows::{Listed, Sections, SectionsLaunch, copy_row, select_rows, zero_row};
 use crate::backend::Refinement;
 use crate::densify::relocation::MAX_PARTS;
 use crate::event::DensifyReport;
 use crate::math::{logit_of_depth, opacity_of_depth, optical_depth, scale_of_parts};
 use crate::rng::Stream;
+use crate::rng::gpu::{Draws, DrawsLaunch, draw};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;

@@ -256,7 +256,7 @@ fn morton_keys(
 #[cube]
 fn cell(coordinate: f32, low: f32, cells_per_unit: f32) -> u32 {
     let cell = (coordinate - low) * cells_per_unit;
-    f32::max(0.0f32, f32::min(cell, MORTON_CELLS - 1.0f32)) as u32
+    f32::clamp(cell, 0.0f32, MORTON_CELLS - 1.0f32) as u32
 }
 
 /// Puts two zero bits between the low ten bits of `v`.

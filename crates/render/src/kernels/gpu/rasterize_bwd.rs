@@ -19,7 +19,7 @@ use super::tile::{STAGED, TileArgs, pixel, stage, staged_splat, tile_args};
 use crate::error::Result;
 use crate::gpu::{Gpu, SHARED_BYTES, UNITS, cube_dim};
 use crate::kernels::cpu::rasterize::RasterOptions;
-use crate::layout::{TILE, grad_lane, lane};
+use crate::layout::{ONE_MINUS_ALPHA_MIN, TILE, grad_lane, lane};
 use crate::math::alpha::LN_2;
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
@@ -36,9 +36,6 @@ const _: () = assert!(
     4 * (STAGED * BATCH + (2 * BATCH + 4) * UNITS as usize + 1) == SHARED_BYTES,
     "adapters are asked for the workgroup memory that this kernel takes"
 );
-
-/// Guard of 1 − α before it divides.
-const ONE_MINUS_ALPHA_MIN: f32 = 1e-6;
 
 /// Gradients of all pairs, by record: `[P, 12]`, lanes as in [`grad_lane`].
 ///

@@ -160,7 +160,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         run_dir.clear()?;
     }
     run_dir.write_settings(config, job.scene, &job.device.describe())?;
-    let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every);
+    let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every, job.device.is_gpu());
     let mut bar = TrainProgress::new(console, config.train.steps);
     let started = Instant::now();
     let mut kept = None;
@@ -222,6 +222,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
             Figure::new(duration(train_secs), "", "training time"),
         ],
         stages: recorder.mean_stages(),
+        step_ms: recorder.mean_step_ms(),
         steps: std::mem::take(&mut recorder.steps),
         test_psnr,
         views,

@@ -32,7 +32,7 @@ Examples:
   gazesplat train my_capture --device gpu
 
 Ctrl-C stops after the current step and keeps what there is; a second Ctrl-C ends at once. A run
-that fails leaves its last good model in `unfinished.ply`.")]
+that fails leaves its last good model in `unfinished.ply`; on a GPU copies go there on the way.")]
 pub struct TrainArgs {
     /// The scene: a COLMAP directory or one with `transforms.json`
     pub scene: PathBuf,
@@ -164,7 +164,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     let mut bar = TrainProgress::new(console, config.train.steps);
     let started = Instant::now();
     let mut kept = None;
-    let ended = keeper::run(&mut trainer, &mut [&mut recorder, &mut bar], stop, job.device, &mut kept);
+    let ended = keeper::run(&mut trainer, &mut [&mut recorder, &mut bar], stop, job.device, &run_dir, &mut kept);
     drop(bar);
     recorder.flush()?;
     let train_secs = started.elapsed().as_secs_f64();
@@ -185,6 +185,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         (Err(failure), _) | (Ok(_), Err(failure)) => return Err(salvage(failure, &run_dir, kept)),
     };
     run_dir.write_model(&cloud)?;
+    run_dir.remove_unfinished()?;
     if outcome == Outcome::Stopped {
         console.note(format_args!("stopped after {num_steps} of {} steps, saving what there is", config.train.steps));
     }
@@ -221,8 +222,8 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
             Figure::new(grouped(eval.num_gaussians), "", "Gaussians"),
             Figure::new(duration(train_secs), "", "training time"),
         ],
-        stages: recorder.mean_stages(),
         step_ms: recorder.mean_step_ms(),
+        stages: recorder.mean_stages(),
         steps: std::mem::take(&mut recorder.steps),
         test_psnr,
         views,
@@ -261,7 +262,7 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
         return failure;
     };
     let path = run_dir.unfinished_path();
-    match gazesplat_core::io::ply::save(&path, &cloud) {
+    match run_dir.write_unfinished(&cloud) {
         Ok(()) => failure.hint_first(format!("the model as it was after step {step} is in `{}`", path.display())),
         Err(_) => failure,
     }

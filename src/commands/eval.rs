@@ -55,7 +55,7 @@ pub struct EvalArgs {
 /// When the device, the model or the scene cannot be used, or the quality is below `--min-psnr`.
 pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
     let device = ComputeDevice::open(args.device.device, console)?;
-    device.guard(|| eval(args, &device, console))
+    eval(args, &device, console)
 }
 
 fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
@@ -65,8 +65,10 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
     let report = with_threads(config.train.threads, || {
         log_machine();
-        let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-        quality::measure(&splats, &images, &config.render_options(), console)
+        device.guard(|| {
+            let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
+            quality::measure(&splats, &images, &config.render_options(), console)
+        })
     })??;
     tracing::info!("images in memory: {} of {}", bytes(images.num_bytes() as u64), images.len());
     if let Some(out) = &args.out {

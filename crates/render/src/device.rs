@@ -27,9 +27,15 @@ impl FromStr for DeviceChoice {
         match text {
             "cpu" => Ok(Self::Cpu),
             "gpu" => Ok(Self::Gpu),
-            _ => text.strip_prefix("gpu:").and_then(|n| n.parse().ok()).map(Self::GpuIndex).ok_or_else(refused),
+            _ => text.strip_prefix("gpu:").and_then(parse_index).map(Self::GpuIndex).ok_or_else(refused),
         }
     }
+}
+
+/// A number as [`DeviceChoice`] writes it: each has one spelling, `+0` and `00` are none.
+fn parse_index(text: &str) -> Option<usize> {
+    let is_plain = text.bytes().all(|b| b.is_ascii_digit()) && (text == "0" || !text.starts_with('0'));
+    if is_plain { text.parse().ok() } else { None }
 }
 
 impl fmt::Display for DeviceChoice {
@@ -274,10 +280,10 @@ mod tests {
 
     #[test]
     fn choices_read_back_and_nonsense_is_refused() {
-        for choice in [DeviceChoice::Cpu, DeviceChoice::Gpu, DeviceChoice::GpuIndex(3)] {
+        for choice in [DeviceChoice::Cpu, DeviceChoice::Gpu, DeviceChoice::GpuIndex(0), DeviceChoice::GpuIndex(10)] {
             assert_eq!(choice.to_string().parse(), Ok(choice));
         }
-        for bad in ["", "GPU", "gpu:", "gpu:-1", "cuda", "cpu:0"] {
+        for bad in ["", "GPU", "gpu:", "gpu:-1", "gpu:+0", "gpu:00", "gpu:01", "gpu: 0", "gpu:1 ", "cuda", "cpu:0"] {
             assert!(bad.parse::<DeviceChoice>().is_err(), "{bad}");
         }
     }

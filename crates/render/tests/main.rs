@@ -11,3 +11,4 @@ mod gpu_equals_cpu;
 mod random_values;
 mod stability;
 mod stability_limits;
+mod termination;

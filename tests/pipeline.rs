@@ -1,5 +1,6 @@
 //! The whole way through the library: scene, training, measurement, rendering; and real captures when they are at hand.
 
+use gazesplat::commands::device::ComputeDevice;
 use gazesplat::commands::train::{TrainJob, Trained, train};
 use gazesplat::{Console, Settings};
 use gazesplat_core::dataset::LoadOptions;
@@ -17,7 +18,8 @@ use std::sync::atomic::AtomicBool;
 fn run(scene: &Path, out: &Path, overrides: &[&str]) -> Trained {
     let overrides: Vec<String> = overrides.iter().map(|&o| o.to_owned()).collect();
     let config = Settings::new().with_overrides(&overrides).and_then(|s| s.resolve()).expect("valid settings");
-    let job = TrainJob { scene, config, out: Some(out), overwrite: false };
+    let device = &ComputeDevice::cpu();
+    let job = TrainJob { scene, config, out: Some(out), overwrite: false, device };
     train(&job, &AtomicBool::new(false), &Console::quiet()).expect("training works")
 }
 
@@ -55,9 +57,10 @@ fn synthetic_scene_is_learned_and_the_model_renders_as_measured() {
     // What a reader of the file sees is what was measured.
     let cloud = ply::load(trained.run_dir.model_path()).expect("readable");
     assert_eq!(cloud, trained.cloud);
-    let splats = Splats::from_cloud(&cloud, &cpu_device());
+    let splats = Splats::from_cloud(&cloud, &cpu_device()).expect("it fits");
     let view = &trained.dataset.test[0];
-    let image = rgb(render(&splats, &view.camera, &RenderOptions::default()).expect("renders")).to_rgb8();
+    let image =
+        rgb(render(&splats, &view.camera, &RenderOptions::default()).expect("renders")).expect("readable").to_rgb8();
     let photograph = images::load_view_image(view).expect("decodes").image;
     let (psnr, _) = difference(&image, &photograph);
     // Rounding the render to 8 bits is all that differs from the measurement in floats.
@@ -85,13 +88,13 @@ fn same_seed_gives_the_same_bytes_on_any_number_of_threads() {
 fn reference_renders_of_a_real_model_are_matched() {
     let Some(scene) = data_path("model_plush") else { return };
     let cloud = ply::load(scene.join("point_cloud.ply")).expect("readable");
-    let splats = Splats::from_cloud(&cloud, &cpu_device());
+    let splats = Splats::from_cloud(&cloud, &cpu_device()).expect("it fits");
     let dataset = Dataset::load(&scene, &LoadOptions::default()).expect("readable");
     let options = RenderOptions { alpha_max: 0.99, near: 0.05, ..RenderOptions::default() };
     let views = dataset.all_views();
     assert_eq!(views.len(), 24);
     for view in views {
-        let image = rgb(render(&splats, &view.camera, &options).expect("renders")).to_rgb8();
+        let image = rgb(render(&splats, &view.camera, &options).expect("renders")).expect("readable").to_rgb8();
         let reference = images::load_view_image(view).expect("decodes").image;
         let (psnr, share_off) = difference(&image, &reference);
         assert!(psnr >= 55.0, "{}: {psnr:.2} dB", view.name);

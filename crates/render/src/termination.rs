@@ -56,6 +56,9 @@ pub struct TerminationLut {
     limits: Arc<[f32]>,
     /// The largest of `limits`: above it no colour stops, and the table is not looked at.
     largest_limit: f32,
+    /// For each cell the largest limit of the cells up to `ahead` farther along every axis.
+    limits_ahead: Arc<[f32]>,
+    ahead: usize,
     gamma: f32,
     space: ColorSpace,
     residual: Residual,
@@ -99,6 +102,8 @@ impl TerminationLut {
             limits: values.clone(),
             values,
             largest_limit: 0.0,
+            limits_ahead: Arc::from([]),
+            ahead: 0,
             gamma: 1.0,
             space,
             residual: Residual::Centre,
@@ -124,6 +129,10 @@ impl TerminationLut {
         self.gamma = gamma;
         self.limits = if gamma == 1.0 { self.values.clone() } else { self.values.iter().map(|v| gamma * v).collect() };
         self.largest_limit = self.limits.iter().copied().fold(0.0, f32::max);
+        // Colours only grow while a pixel composites, and by no more than what is left of it: from where a table is first
+        // looked at, by its largest limit.
+        self.ahead = ((self.size as f32 * self.largest_limit) as usize + 1).min(self.size);
+        self.limits_ahead = largest_ahead(&self.limits, self.size, self.ahead).into();
         Ok(self)
     }
 
@@ -186,6 +195,17 @@ impl TerminationLut {
         self.largest_limit
     }
 
+    /// For each cell the largest limit of the cells that are up to [`TerminationLut::ahead`] farther along every axis: what
+    /// a colour of the cell can ever be compared with, `[size³]`.
+    pub fn limits_ahead(&self) -> &[f32] {
+        &self.limits_ahead
+    }
+
+    /// Cells that a colour can advance along an axis after T·c_max has come down to the largest limit.
+    pub fn ahead(&self) -> usize {
+        self.ahead
+    }
+
     /// γ.
     pub fn gamma(&self) -> f32 {
         self.gamma
@@ -216,6 +236,20 @@ impl TerminationLut {
         let cell = |c: f32| ((self.size as f32 * c.clamp(0.0, BELOW_ONE)) as usize).min(self.size - 1);
         self.limits[(cell(color[0]) * self.size + cell(color[1])) * self.size + cell(color[2])]
     }
+}
+
+/// For each cell the largest value of those up to `ahead` farther along every axis.
+fn largest_ahead(values: &[f32], size: usize, ahead: usize) -> Vec<f32> {
+    let mut largest = values.to_vec();
+    for stride in [1, size, size * size] {
+        // Ascending, so that what lies ahead has not been replaced yet.
+        for i in 0..largest.len() {
+            let cell = i / stride % size;
+            let reach = ahead.min(size - 1 - cell);
+            largest[i] = (0..=reach).map(|k| largest[i + k * stride]).fold(0.0, f32::max);
+        }
+    }
+    largest
 }
 
 impl Termination {
@@ -295,6 +329,25 @@ mod tests {
         }
         for size in 1..=MAX_LUT_SIZE {
             assert_eq!((size as f32 * BELOW_ONE) as usize, size - 1, "{size}");
+        }
+    }
+
+    #[test]
+    fn limits_ahead_are_the_largest_of_the_block_ahead() {
+        let size = 4;
+        let values: Vec<f32> = (0..64).map(|i| ((i * 37) % 64 + 1) as f32 / 4096.0).collect();
+        for (gamma, ahead) in [(1.0, 1), (20.0, 2), (1e6, 4)] {
+            let lut = TerminationLut::new(size, values.clone(), ColorSpace::Srgb).and_then(|lut| lut.with_gamma(gamma));
+            let lut = lut.expect("legal");
+            assert_eq!(lut.ahead(), ahead);
+            for i in 0..64 {
+                let cell = [i / 16, i / 4 % 4, i % 4];
+                let block = (0..64).filter(|j| {
+                    let other = [j / 16, j / 4 % 4, j % 4];
+                    (0..3).all(|c| (cell[c]..=cell[c] + ahead).contains(&other[c]))
+                });
+                assert_eq!(lut.limits_ahead()[i], block.map(|j| lut.limits()[j]).fold(0.0, f32::max), "{i}");
+            }
         }
     }
 

@@ -237,8 +237,9 @@ fn passes_with_gradients_and_linear_tables_are_refused() {
     options.pass = gazesplat_render::Pass::Inference;
     assert!(scene.refusal(&options).is_none());
     // Also where the model is tracked, whatever the options say.
-    let tracked =
-        gazesplat_render::Splats::from_cloud(&scene.cloud, &crate::common::device().autodiff()).require_grad();
+    let tracked = gazesplat_render::Splats::from_cloud(&scene.cloud, &crate::common::device().autodiff())
+        .expect("fits")
+        .require_grad();
     let refused = gazesplat_render::render(&tracked, &scene.camera, &options).err();
     assert!(refused.is_some_and(|e| e.to_string().contains("tracked")));
     options.termination = Termination::Lut(table(6, 8).read_as(ColorSpace::Linear));

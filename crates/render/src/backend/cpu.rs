@@ -15,7 +15,6 @@ use crate::kernels::cpu::{
 use crate::layout::{CLUSTER, lane};
 use crate::options::StatsMode;
 use crate::stats::{RenderStats, SplatStats};
-use crate::termination::ColorMax;
 use burn::backend::{
     NdArray,
     tensor::{FloatTensor, IntTensor},
@@ -53,8 +52,7 @@ pub(crate) fn draw(g: &GaussianSlices<'_>, frame: &Frame, counters: StatsLevel) 
     // Bounds pay when a model is drawn and not changed between frames; a training step reads every row anyway.
     let bounds = (!frame.keep && g.len() > 16 * CLUSTER).then(|| clusters(g));
     let splats = project(g, &frame.view, bounds.as_deref());
-    let wants_maximum = frame.raster.lut.as_ref().is_some_and(|lut| lut.color_max() == ColorMax::Tile);
-    let lists = bin(&splats, grid, BinExtras { records: frame.keep, color_max: wants_maximum })?;
+    let lists = bin(&splats, grid, BinExtras { records: frame.keep, color_max: frame.raster.lut.is_some() })?;
     let raster = rasterize(splats.rows(), &lists, &frame.raster, counters, frame.keep);
     let stats = RenderStats {
         num_splats: g.len() as u64,

@@ -1,12 +1,13 @@
 //! What the rasterisers do with a termination table: reading it, asking it, and what becomes of the rest.
 //!
-//! Sixteen pixels of a tile row at a time. The table is looked at for rows only in which some pixel has come within reach
-//! of its largest entry. NaN counts as a dark channel; an empty tile never asks.
+//! Sixteen pixels of a tile row at a time. The table is looked at for rows only in which some pixel has come below its
+//! line: first the largest entry, and once that has been reached the largest entry that its colour can still come to. NaN
+//! counts as a dark channel; an empty tile never asks.
 
 use super::bin::TileLists;
 use super::rasterize::RasterOptions;
 use super::tile::Row;
-use crate::simd::Simd;
+use crate::simd::{LANES, Simd};
 use crate::termination::{BELOW_ONE, ColorMax, Residual};
 
 /// The termination table as a tile sees it.
@@ -17,6 +18,8 @@ pub(super) struct TileLut<'a> {
     size: f32,
     /// The largest of them.
     largest: f32,
+    /// For each cell the largest limit its colours can still come to; empty where that is not known.
+    limits_ahead: &'a [f32],
     /// Bound of the hidden channels.
     color_max: f32,
     residual: Residual,
@@ -25,23 +28,41 @@ pub(super) struct TileLut<'a> {
 /// The table in tile `id`; without one, what is never read.
 pub(super) fn tile_lut<'a>(options: &'a RasterOptions, lists: &TileLists<'_>, id: usize) -> TileLut<'a> {
     let Some(lut) = &options.lut else {
-        return TileLut { limits: &[], size: 0.0, largest: 0.0, color_max: 1.0, residual: Residual::Background };
+        let residual = Residual::Background;
+        return TileLut { limits: &[], size: 0.0, largest: 0.0, limits_ahead: &[], color_max: 1.0, residual };
     };
+    let brightest = lists.color_max[id].max(1.0);
     let color_max = match lut.color_max() {
         ColorMax::One => 1.0,
-        ColorMax::Tile => options.background.iter().copied().fold(1.0, f32::max).max(lists.color_max[id]),
+        ColorMax::Tile => options.background.iter().copied().fold(brightest, f32::max),
     };
     let (limits, size, largest) = (lut.limits(), lut.size() as f32, lut.largest_limit());
-    TileLut { limits, size, largest, color_max, residual: lut.residual() }
+    // Cells that a colour advances at most after T·c_max has come down to the largest limit, and what rounding adds.
+    let advance = 1.001 * size * largest * (brightest / color_max);
+    let limits_ahead = if advance < lut.ahead() as f32 { lut.limits_ahead() } else { &[] };
+    TileLut { limits, size, largest, limits_ahead, color_max, residual: lut.residual() }
+}
+
+impl TileLut<'_> {
+    /// The line of pixels that have not been looked at: no entry is larger, whatever the colour.
+    pub fn first_line(&self) -> Row {
+        Row([self.largest; LANES])
+    }
 }
 
 /// Pixels of a row among `hit` that stop because the rest cannot be seen: T·c_max ≤ γ·LUT(C) (JND Sec. 3). Those
-/// that have stopped before are not among them.
+/// that have stopped before are not among them. `line`: values of T·c_max above which no pixel of the row can stop.
 #[inline(always)]
-pub(super) fn below_limit<S: Simd>(s: S, lut: TileLut<'_>, hit: S::M, t: S::F, channels: &[Row; 4]) -> S::M {
+pub(super) fn below_limit<S: Simd>(
+    s: S,
+    lut: TileLut<'_>,
+    hit: S::M,
+    t: S::F,
+    channels: &[Row; 4],
+    line: &mut Row,
+) -> S::M {
     let left = s.mul(t, s.splat(lut.color_max));
-    // No entry is larger, so above this line no pixel stops, whatever its colour.
-    let near = s.and_not(s.gt_where(hit, t, s.splat(0.0)), s.gt(left, s.splat(lut.largest)));
+    let near = s.and_not(s.gt_where(hit, t, s.splat(0.0)), s.gt(left, s.load(&line.0)));
     if s.bits(near) == 0 {
         return near;
     }
@@ -50,8 +71,13 @@ pub(super) fn below_limit<S: Simd>(s: S, lut: TileLut<'_>, hit: S::M, t: S::F, c
         let color = s.min(s.max(s.load(&channels[c].0), s.splat(0.0)), s.splat(BELOW_ONE));
         s.truncate(s.mul(color, size))
     });
-    let limit = s.lookup(lut.limits, s.fma(s.fma(red, size, green), size, blue));
-    s.and_not(near, s.gt(left, limit))
+    let cell = s.fma(s.fma(red, size, green), size, blue);
+    if !lut.limits_ahead.is_empty() {
+        // Channels never shrink: from here on the colour meets the entries ahead of its cell only.
+        let ahead = s.lookup(lut.limits_ahead, cell);
+        s.store(s.select(near, ahead, s.load(&line.0)), &mut line.0);
+    }
+    s.and_not(near, s.gt(left, s.lookup(lut.limits, cell)))
 }
 
 /// What a pixel that stopped receives per unit of the transmittance left; `color` is what it has composited.

@@ -189,6 +189,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
             let list = &lists.pair_splats[pairs];
             let lut = tile_lut(options, lists, id);
             let mut rows = [FRESH; TILE];
+            let mut lines = [lut.first_line(); TILE];
             let outside = s.and_not(s.mask(u16::MAX), s.mask(tile.lane_bits()));
             for row in &mut rows[..tile.height] {
                 s.store(s.select(outside, s.splat(-1.0), s.splat(1.0)), &mut row.t.0);
@@ -212,6 +213,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
                             &mut rows,
                             options,
                             lut,
+                            &mut lines,
                             counters,
                         );
                         stats.num_lane_pixels += (num_rows * LANES) as u64;
@@ -264,6 +266,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
     rows: &mut [PixelRow; TILE],
     options: &RasterOptions,
     lut: TileLut<'_>,
+    lines: &mut [Row; TILE],
     counters: Option<&mut PairStats>,
 ) -> usize {
     let (first, end) = (g.first_row as usize, (g.end_row as usize).min(TILE));
@@ -281,6 +284,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
     let t_stop = s.splat(options.t_stop);
     let (zero, position) = (s.splat(0.0), s.splat_i(index));
     let (mut num_blended, mut weight_max, mut weight_sum) = (0, s.splat(0.0), s.splat(0.0));
+    let mut y = first;
     for (row, center) in rows[first..end].iter_mut().zip(&CENTERS[first..end]) {
         let dy = s.splat(center - g.mean_y);
         let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
@@ -296,7 +300,8 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
         // Kerbl 2023, App. C: stop before the splat that would end the pixel.
         let mut blended = s.gt_where(hit, t_next, t_stop);
         if LUT {
-            blended = s.and_not(blended, below_limit(s, lut, hit, t, &row.channels));
+            blended = s.and_not(blended, below_limit(s, lut, hit, t, &row.channels, &mut lines[y]));
+            y += 1;
         }
         let weight = s.mul_where(blended, alpha, t);
         // No branch: in a dense tile some pixel stops at almost every splat.

@@ -1,6 +1,7 @@
 //! `gazesplat eval`: how close a model comes to the photographs of a scene.
 
 use super::device::ComputeDevice;
+use super::termination::TerminationArgs;
 use super::{Model, Split, load_scene, log_machine, quality};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, grouped};
@@ -8,7 +9,7 @@ use crate::diagnostics::{Failure, Result};
 use crate::run_dir;
 use clap::Args;
 use gazesplat_core::io::images::ImageCache;
-use gazesplat_render::Splats;
+use gazesplat_render::{RenderOptions, Splats};
 use gazesplat_train::with_threads;
 use std::path::PathBuf;
 
@@ -38,6 +39,9 @@ pub struct EvalArgs {
     /// Which views of the scene
     #[arg(long, value_enum, default_value = "test")]
     pub split: Split,
+    /// When a pixel stops
+    #[command(flatten)]
+    pub termination: TerminationArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -54,6 +58,7 @@ pub struct EvalArgs {
 /// # Errors
 /// When the device, the model or the scene cannot be used, or the quality is below `--min-psnr`.
 pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
+    args.termination.check()?;
     let device = ComputeDevice::open(args.device.device, console)?;
     eval(args, &device, console)
 }
@@ -65,9 +70,10 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
     let report = with_threads(config.train.threads, || {
         log_machine();
+        let options = RenderOptions { termination: args.termination.termination()?, ..config.render_options() };
         device.guard(|| {
             let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-            quality::measure(&splats, &images, &config.render_options(), console)
+            quality::measure(&splats, &images, &options, console)
         })
     })??;
     tracing::info!("images in memory: {} of {}", bytes(images.num_bytes() as u64), images.len());

@@ -6,6 +6,7 @@
 pub mod html;
 pub mod pictures;
 pub mod plots;
+pub mod study;
 
 use gazesplat_core::RgbImage8;
 

@@ -12,4 +12,5 @@ mod render;
 mod settings;
 mod support;
 mod synth;
+mod termination;
 mod train;

@@ -116,6 +116,14 @@ impl Gpu {
         CubeTensor::new_contiguous(self.client.clone(), self.device.clone(), shape, handle, DType::U32)
     }
 
+    /// Uploads values as an `f32` buffer of `shape`.
+    pub fn upload_f32(&self, values: &[f32], shape: &[usize]) -> CubeTensor {
+        let values = if values.is_empty() { &[0.0][..] } else { values };
+        let handle = self.client.create_from_slice(bytemuck::cast_slice(values));
+        let shape = Shape::from(shape.to_vec());
+        CubeTensor::new_contiguous(self.client.clone(), self.device.clone(), shape, handle, DType::F32)
+    }
+
     /// Waits for the queue and downloads a `u32` buffer.
     ///
     /// # Errors

@@ -129,7 +129,7 @@ fn one_adapter_gives_the_same_bits_twice() {
 }
 
 /// Files whose test bodies all run on both processors.
-const ON_BOTH: [(&str, &str); 8] = [
+const ON_BOTH: [(&str, &str); 9] = [
     ("counters", include_str!("counters.rs")),
     ("determinism", include_str!("determinism.rs")),
     ("finite_diff", include_str!("finite_diff.rs")),
@@ -138,6 +138,7 @@ const ON_BOTH: [(&str, &str); 8] = [
     ("random_values", include_str!("random_values.rs")),
     ("stability", include_str!("stability.rs")),
     ("stability_limits", include_str!("stability_limits.rs")),
+    ("termination", include_str!("termination.rs")),
 ];
 
 #[test]

@@ -51,6 +51,8 @@ pub struct TileLists {
     pub tile_offsets: CubeTensor,
     /// Splat and record of each pair, `[P, 2]`.
     pub pairs: CubeTensor,
+    /// Bits of the largest colour channel of each tile's splats, at least 0, `[tiles]`. Empty unless asked for.
+    pub color_max: CubeTensor,
     /// First record of each splat, `[V + 1]` or longer.
     pub record_offsets: CubeTensor,
     /// Number of splats V.
@@ -63,12 +65,18 @@ pub struct TileLists {
     pub num_non_finite: u64,
 }
 
-/// Builds the lists of all tiles.
+/// Builds the lists of all tiles; `wants_maximum` fills [`TileLists::color_max`].
 ///
 /// # Errors
 /// [`Error::Limit`] if there are more pairs than indices, or a buffer would be larger than the adapter takes;
 /// [`Error::Device`] when the adapter does not answer.
-pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid) -> Result<TileLists> {
+pub fn bin(
+    gpu: &Gpu,
+    g: &GaussianBuffers,
+    projected: &Projected,
+    grid: TileGrid,
+    wants_maximum: bool,
+) -> Result<TileLists> {
     let n = g.len;
     let Projected { lanes, visible_offsets } = projected;
     if grid.len() > MAX_TILES {
@@ -148,6 +156,8 @@ pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid
     // 5. Lists: where each tile's begins, and what stands in them.
     let tile_offsets = gpu.zeros("bytes of tile offsets", &[grid.len() + 1], DType::U32)?;
     let pairs = gpu.empty("bytes of pairs", &[num_pairs, 2], DType::U32)?;
+    let num_maxima = if wants_maximum { grid.len() } else { 0 };
+    let color_max = gpu.zeros("bytes of tile maxima", &[num_maxima], DType::U32)?;
     if num_pairs > 0 {
         list_pairs::launch(
             &gpu.client,
@@ -158,8 +168,11 @@ pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid
             pair_splats.into_buffer_arg(),
             pairs.clone().into_buffer_arg(),
             tile_offsets.clone().into_buffer_arg(),
+            compact_lanes.clone().into_buffer_arg(),
+            color_max.clone().into_buffer_arg(),
             num_pairs as u32,
             grid.len() as u32,
+            wants_maximum,
         );
     }
     Ok(TileLists {
@@ -168,6 +181,7 @@ pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid
         global_from_compact,
         tile_offsets,
         pairs,
+        color_max,
         record_offsets,
         num_visible,
         num_pairs,
@@ -337,7 +351,7 @@ fn emit(
     }
 }
 
-/// Splat and record of each pair in list order, and the start of each tile's list.
+/// Splat and record of each pair in list order, the start of each tile's list, and the largest channel in it.
 #[cube(launch)]
 fn list_pairs(
     pair_tiles: &[u32],
@@ -345,8 +359,11 @@ fn list_pairs(
     pair_splats: &[u32],
     pairs: &mut [u32],
     tile_offsets: &mut [u32],
+    lanes: &[f32],
+    color_max: &[Atomic<u32>],
     num_pairs: u32,
     num_tiles: u32,
+    #[comptime] wants_maximum: bool,
 ) {
     let p = ABSOLUTE_POS;
     if p < num_pairs as usize {
@@ -356,6 +373,14 @@ fn list_pairs(
         // A list begins behind the last pair of an earlier tile; tiles between two pairs are empty. The number behind the
         // last tile ends the last list.
         let tile = pair_tiles[p];
+        if comptime!(wants_maximum) {
+            let at = pair_splats[record as usize] as usize * lane::COUNT + lane::RED;
+            let largest = f32::max(f32::max(lanes[at], lanes[at + 1]), lanes[at + 2]);
+            // The bits of positive floats order like the floats. Most splats stay below 1, which counts anyway.
+            if largest > 1.0_f32 {
+                color_max[tile as usize].fetch_max(u32::reinterpret(largest));
+            }
+        }
         let mut first = 0u32;
         if p > 0 {
             first = pair_tiles[p - 1] + 1;

@@ -1,0 +1,3 @@
+//! Models of human vision.
+
+pub mod jnd;

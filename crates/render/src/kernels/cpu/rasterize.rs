@@ -7,6 +7,8 @@
 //!
 //! With a termination table a pixel also stops before a splat when its colour allows it (JND Sec. 3). The table is looked
 //! at for rows only in which some pixel has come within reach of its largest entry.
+//!
+//! A few lines over the aim: image, counters and table are one loop with options at compile time, not three copies.
 
 use super::bin::TileLists;
 use super::lut::{TileLut, below_limit, residual, tile_lut};

@@ -260,6 +260,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
 }
 
 /// Blends one splat into the rows it reaches. Returns the number of rows visited.
+#[expect(clippy::too_many_arguments, reason = "the state of the loop, passed in registers")]
 #[inline(always)]
 fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool>(
     s: S,

@@ -64,15 +64,52 @@ pub fn render_probed(
     render_with(splats, probe.0.clone(), camera, options)
 }
 
-fn render_with(splats: &Splats, probe: Tensor<2>, camera: &Camera, options: &RenderOptions) -> Result<Rendered> {
-    let frame = frame(splats, camera, options)?;
-    let parameters = Parameters {
+/// What a frame does and is worth, without the frame.
+#[derive(Debug, Clone)]
+pub struct Counted {
+    /// What would be done and skipped.
+    pub stats: RenderStats,
+    /// Counters per Gaussian and tile.
+    pub splat_stats: SplatStats,
+}
+
+/// Counts what drawing `splats` as `camera` sees them does, as [`render`] with the same options would, but draws nothing:
+/// colours are not evaluated, unless a termination table asks for them, and no image is written. [`StatsMode::None`]
+/// counts nothing but the frame's totals.
+///
+/// # Errors
+/// As [`render`]; [`Error::Parameter`] for a pass with gradients.
+pub fn count(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Counted> {
+    if options.pass != Pass::Inference {
+        return Err(Error::Parameter {
+            name: "pass",
+            found: format!("{:?}", options.pass),
+            expected: "a pass for inference: counting keeps nothing for a gradient",
+        });
+    }
+    let mut frame = Frame { draws: false, ..frame(splats, camera, options)? };
+    if frame.raster.lut.is_none() {
+        frame.sh_degree = 0;
+    }
+    let probe = Probe { means2d: Tensor::<2>::zeros([0, 4], &splats.device()).into_dispatch() };
+    let out = <Dispatch as RenderOps>::render_forward(parameters(splats), probe, frame);
+    let (stats, splat_stats) = out.outcome?;
+    Ok(Counted { stats, splat_stats })
+}
+
+fn parameters(splats: &Splats) -> Parameters<Dispatch> {
+    Parameters {
         means: splats.means.clone().into_dispatch(),
         quats: splats.quats.clone().into_dispatch(),
         log_scales: splats.log_scales.clone().into_dispatch(),
         opacity_logits: splats.opacity_logits.clone().into_dispatch(),
         sh: splats.sh.clone().into_dispatch(),
-    };
+    }
+}
+
+fn render_with(splats: &Splats, probe: Tensor<2>, camera: &Camera, options: &RenderOptions) -> Result<Rendered> {
+    let frame = frame(splats, camera, options)?;
+    let parameters = parameters(splats);
     let out = <Dispatch as RenderOps>::render_forward(parameters, Probe { means2d: probe.into_dispatch() }, frame);
     let (stats, splat_stats) = out.outcome?;
     Ok(Rendered { image: Tensor::from_dispatch(out.image), stats, splat_stats })
@@ -103,6 +140,7 @@ fn frame(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Fr
         sh_degree,
         stats: options.stats,
         keep: options.pass != Pass::Inference,
+        draws: true,
     })
 }
 

@@ -44,7 +44,8 @@ impl RenderStats {
     }
 }
 
-/// Work and worth of each Gaussian in one view, `[N]` each; empty where the [`crate::StatsMode`] does not fill it.
+/// Work and worth of each Gaussian in one view, `[N]` each, and work of each tile; empty where the [`crate::StatsMode`] does
+/// not fill it.
 ///
 /// A tile's list is walked front to back until its last pixel has stopped, at position E; a pixel blends an entry iff
 /// α ≥ 1/255 and T(1−α) is above the stopping transmittance. All counters are integers or maxima, so they do not depend
@@ -63,4 +64,15 @@ pub struct SplatStats {
     pub weight_sum: Vec<u64>,
     /// Tiles in which it is blended in at least one pixel.
     pub tiles_blended: Vec<u32>,
+    /// Lengths and ends of the tiles' lists; filled from [`crate::StatsMode::Tiles`] on.
+    pub tiles: TileStats,
+}
+
+/// Work of each tile in one view, row-major, `[tiles]` each.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct TileStats {
+    /// Entries of the tile's list, n.
+    pub num_pairs: Vec<u32>,
+    /// Position E at which its last pixel stopped: entries that were worked through.
+    pub num_pairs_used: Vec<u32>,
 }

@@ -102,8 +102,12 @@ fn saved<B: HostTensors>(frame: HostFrame, size: [usize; 2], keep: bool) -> Save
 
 fn forward<B: HostTensors>(parameters: &Parameters<B>, frame: &Frame) -> Forward<B> {
     let size = [frame.view.height as usize, frame.view.width as usize];
-    let image_shape = [size[0], size[1], frame.raster.num_channels()];
+    let image_size = if frame.draws { size } else { [0, 0] };
+    let image_shape = [image_size[0], image_size[1], frame.raster.num_channels()];
     let drawn = with_slices(parameters, frame.sh_degree, |g| {
+        if !frame.draws {
+            return draw(g, frame, StatsLevel::from_mode(frame.stats.max(StatsMode::Dominance)));
+        }
         let mut drawn = draw(g, frame, StatsLevel::None)?;
         // Pixel counters come from a pass of their own: counting in the plain kernel would slow every frame.
         let level = StatsLevel::from_mode(frame.stats);

@@ -73,6 +73,12 @@ fn nothing(gpu: &Gpu, dtype: DType) -> CubeTensor {
     gpu.empty("bytes", &[0], dtype).expect("an adapter takes a buffer of four bytes")
 }
 
+/// An image without pixels.
+fn empty_image(gpu: &Gpu, frame: &Frame) -> CubeTensor {
+    let channels = frame.raster.num_channels();
+    gpu.empty("bytes", &[0, 0, channels], DType::F32).expect("an adapter takes a buffer of four bytes")
+}
+
 fn saved(gpu: &Gpu, frame: Option<DeviceFrame>) -> Saved<CubeBackend> {
     let Some(DeviceFrame { lists, raster, .. }) = frame else {
         return Saved {
@@ -136,15 +142,13 @@ impl RenderOps for CubeBackend {
         let g = GaussianBuffers::new(parameters, frame.sh_degree);
         match draw(&gpu, &g, &frame) {
             Ok(mut drawn) => {
-                let image = drawn.raster.image.clone();
+                let image = if frame.draws { drawn.raster.image.clone() } else { empty_image(&gpu, &frame) };
                 let outcome = Ok((drawn.stats, std::mem::take(&mut drawn.splat_stats)));
                 let kept = (frame.keep).then_some(drawn);
                 Forward { image, saved: saved(&gpu, kept), outcome }
             }
             Err(error) => {
-                let channels = frame.raster.num_channels();
-                let image =
-                    gpu.empty("bytes", &[0, 0, channels], DType::F32).expect("an adapter takes a buffer of four bytes");
+                let image = empty_image(&gpu, &frame);
                 Forward { image, saved: saved(&gpu, None), outcome: Err(error) }
             }
         }

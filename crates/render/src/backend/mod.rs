@@ -50,12 +50,14 @@ pub struct Frame {
     pub stats: StatsMode,
     /// Keep what a backward pass needs.
     pub keep: bool,
+    /// Draw the image; else only count.
+    pub draws: bool,
 }
 
 /// The image of a frame, and what its backward pass reads.
 #[derive(Debug, Clone, ExtensionType)]
 pub struct Forward<B: Backend> {
-    /// `[H, W, 4 or 5]`.
+    /// `[H, W, 4 or 5]`; `[0, 0, 4 or 5]` unless [`Frame::draws`].
     pub image: FloatTensor<B>,
     /// What the frame leaves for its backward pass.
     #[extension_type]

@@ -8,7 +8,7 @@ use super::project::ProjectedSplats;
 use super::rasterize::Raster;
 use crate::options::StatsMode;
 use crate::simd::LANES;
-use crate::stats::SplatStats;
+use crate::stats::{SplatStats, TileStats};
 
 /// Which counters the rasteriser fills.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -83,8 +83,13 @@ pub fn splat_stats(
         pixels_blended: vec![0; rows(StatsMode::All)],
         weight_sum: vec![0; rows(StatsMode::All)],
         tiles_blended: vec![0; rows(StatsMode::All)],
+        tiles: TileStats::default(),
     };
     if mode >= StatsMode::Tiles {
+        out.tiles = TileStats {
+            num_pairs: lists.tile_offsets.windows(2).map(|w| w[1] - w[0]).collect(),
+            num_pairs_used: raster.tile_ends.to_vec(),
+        };
         for (&start, &end) in lists.tile_offsets.iter().zip(raster.tile_ends.iter()) {
             for &splat in &lists.pair_splats[start as usize..][..end as usize] {
                 out.tiles_used[splats.global_from_compact[splat as usize] as usize] += 1;

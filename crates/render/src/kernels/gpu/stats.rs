@@ -13,7 +13,7 @@ use crate::error::Result;
 use crate::gpu::{Gpu, UNITS, cube_dim};
 use crate::kernels::cpu::rasterize::RasterOptions;
 use crate::options::StatsMode;
-use crate::stats::SplatStats;
+use crate::stats::{SplatStats, TileStats};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
@@ -80,11 +80,14 @@ pub fn splat_stats(
         pixels_blended: vec![0; rows(StatsMode::All)],
         weight_sum: vec![0; rows(StatsMode::All)],
         tiles_blended: vec![0; rows(StatsMode::All)],
+        tiles: TileStats::default(),
     };
     if mode == StatsMode::None {
         return Ok((out, 0));
     }
     if lists.num_pairs == 0 {
+        let none = vec![0; lists.grid.len()];
+        out.tiles = TileStats { num_pairs: none.clone(), num_pairs_used: none };
         return Ok((out, lists.grid.len() as u64));
     }
     let counters = gpu.zeros("bytes of pair counters", &[lists.num_pairs, pair_word::COUNT], DType::U32)?;
@@ -117,7 +120,9 @@ pub fn splat_stats(
         per_splat.clone().into_buffer_arg(),
         lists.num_visible as u32,
     );
-    let [words, ids, offsets] = gpu.read_all_u32([&per_splat, &lists.global_from_compact, &lists.tile_offsets])?;
+    let [words, ids, offsets, ends] =
+        gpu.read_all_u32([&per_splat, &lists.global_from_compact, &lists.tile_offsets, tile_ends])?;
+    out.tiles = TileStats { num_pairs: offsets.windows(2).map(|w| w[1] - w[0]).collect(), num_pairs_used: ends };
     let num_empty = offsets.windows(2).filter(|w| w[0] == w[1]).count() as u64;
     for (row, &id) in words.chunks_exact(splat_word::COUNT).zip(&ids) {
         let i = id as usize;

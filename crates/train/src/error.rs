@@ -1,5 +1,7 @@
 //! The one error type of this crate.
 
+use std::path::PathBuf;
+
 /// Result with this crate's [`Error`].
 pub type Result<T> = std::result::Result<T, Error>;
 
@@ -38,6 +40,17 @@ pub enum Error {
         /// The first Gaussian with a non-finite parameter, else the one with the largest; `None` for an empty model.
         offender: Option<Offender>,
     },
+    /// A model that cannot be pruned, or not under that guard.
+    #[error("{0}")]
+    Prune(String),
+    /// A checkpoint cannot be taken up; it is still as it was.
+    #[error("`{}` cannot be resumed: {message}", path.display())]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        message: String,
+    },
     /// An observer failed, for instance because a log could not be written.
     #[error("{0}")]
     Observer(#[source] Box<dyn std::error::Error + Send + Sync>),
@@ -66,7 +79,11 @@ impl Error {
             ),
             Self::Threads { .. } => Some("set train.threads to a smaller number, or to 0 for one per core".into()),
             Self::Parameter { .. } => Some("`gazesplat train --help` lists every setting with its default".into()),
-            Self::Render(_) | Self::Observer(_) => None,
+            Self::Checkpoint { .. } => Some(
+                "resume with the model, scene and settings the run began with, or begin anew in another directory"
+                    .into(),
+            ),
+            Self::Prune(_) | Self::Render(_) | Self::Observer(_) => None,
         }
     }
 }

@@ -5,6 +5,7 @@
 //! `MCMC` = Kheradmand 2024, Wang 2004 (SSIM), Kingma 2015 (Adam).
 
 pub mod backend;
+pub mod checkpoint;
 pub mod config;
 pub mod densify;
 pub mod error;
@@ -22,6 +23,7 @@ pub mod losses;
 pub mod math;
 pub mod metrics;
 pub mod optim;
+pub mod prune;
 pub mod rng;
 pub mod run;
 mod simd;

@@ -29,6 +29,20 @@ pub fn normals(word0: u32, word1: u32, word2: u32, word3: u32) -> Vec3 {
     Vec3 { x: radius_a * f32::cos(angle_a), y: radius_a * f32::sin(angle_a), z: radius_b * f32::cos(angle_b) }
 }
 
+/// Tiles a Gaussian may be used in without scale decay, T (RTGS Eq. 6).
+pub const FREE_TILES: u32 = 4;
+
+/// G = max(U − T, 0) of a Gaussian used in U tiles (RTGS Eq. 6).
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn excess_tiles(used: u32) -> f32 {
+    let mut excess = 0u32;
+    if used > FREE_TILES {
+        excess = used - FREE_TILES;
+    }
+    excess as f32
+}
+
 /// Steepness of the gate of position noise (MCMC, Eq. 8).
 pub const GATE_STEEPNESS: f32 = 100.0;
 /// Opacity at which the gate is one half.

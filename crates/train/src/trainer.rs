@@ -16,16 +16,25 @@ use crate::event::{StageMs, StepReport};
 use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
 use crate::kernels::cpu::rows::Rows;
 use crate::limits::check_limits;
-use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses};
-use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, schedule};
+use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses, scale_decay};
+use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, Snapshot, schedule};
 use crate::rng::{Stream, draw, permutation, uniform};
 use burn::tensor::{Device, Gradients, Tensor};
 use gazesplat_core::dataset::Dataset;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Camera, GaussianCloud, sh};
-use gazesplat_render::{Pass, RenderOptions, Splats, is_gpu, render};
+use gazesplat_render::{Pass, RenderOptions, Rendered, Splats, StatsMode, is_gpu, render};
 use std::sync::Arc;
 use std::time::Instant;
+
+/// γ of scale decay (RTGS Eq. 4).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct ScaleDecay {
+    /// γ.
+    pub weight: f32,
+    /// Unit of the scales, world units.
+    pub scale_unit: f32,
+}
 
 /// A model in training.
 pub struct Trainer {
@@ -37,6 +46,7 @@ pub struct Trainer {
     /// Step at which the rows were last sorted.
     sorted_at: u32,
     losses: WeightedLosses,
+    scale_decay: Option<ScaleDecay>,
     center: [f32; 3],
     extent: f32,
     step: u32,
@@ -94,12 +104,75 @@ impl Trainer {
             strategy,
             sorted_at: 0,
             losses,
+            scale_decay: None,
             center,
             extent,
             step: 0,
             view_order: None,
             messages: Vec::new(),
         })
+    }
+
+    /// Adds `weight` times `loss` to what every step minimises.
+    pub fn add_loss(&mut self, weight: f32, loss: Box<dyn crate::losses::ImageLoss>) {
+        self.losses = std::mem::take(&mut self.losses).with(weight, loss);
+    }
+
+    /// Shrinks Gaussians in many tiles from now on, or no longer (RTGS Eq. 4).
+    pub(crate) fn set_scale_decay(&mut self, decay: Option<ScaleDecay>) {
+        self.scale_decay = decay;
+    }
+
+    /// Radius of the scene, world units.
+    pub(crate) fn extent(&self) -> f32 {
+        self.extent
+    }
+
+    /// The model with its optimiser, for operations between steps.
+    pub(crate) fn state(&mut self) -> &mut ModelState {
+        &mut self.state
+    }
+
+    /// Waits for all steps so far.
+    ///
+    /// # Errors
+    /// [`Error::NonFiniteLoss`] of the first that failed.
+    pub(crate) fn settle(&mut self) -> Result<()> {
+        self.checked_status().map(drop)
+    }
+
+    /// A trainer at step 0 for `cloud` with a fresh optimiser, on the same views and with the same losses.
+    ///
+    /// # Errors
+    /// As [`Trainer::from_cloud`].
+    pub(crate) fn restarted(&mut self, cloud: &GaussianCloud, config: Config) -> Result<Self> {
+        let mut rows = Rows::new(Columns::from_cloud(cloud));
+        rows.sort_spatially();
+        Ok(Self {
+            config,
+            images: Arc::clone(&self.images),
+            test_images: Arc::clone(&self.test_images),
+            state: ModelState::new(rows.params, AdamSettings::default(), self.state.device())?,
+            strategy: Box::new(Fixed),
+            sorted_at: 0,
+            losses: std::mem::take(&mut self.losses),
+            scale_decay: None,
+            center: self.center,
+            extent: self.extent,
+            step: 0,
+            view_order: None,
+            messages: Vec::new(),
+        })
+    }
+
+    /// Goes on at step `step` with the model of `snapshot`.
+    ///
+    /// # Errors
+    /// As [`ModelState::restore`].
+    pub(crate) fn resume_at(&mut self, step: u32, snapshot: &Snapshot) -> Result<()> {
+        self.state.restore(snapshot)?;
+        (self.step, self.view_order) = (step, None);
+        Ok(())
     }
 
     /// The model as it is now; later steps leave these tensors as they are.
@@ -142,7 +215,12 @@ impl Trainer {
     /// # Errors
     /// [`Error::Render`] when the device does not answer.
     pub fn to_cloud(&self) -> Result<GaussianCloud> {
-        let cloud = self.state.lent().to_cloud()?;
+        self.exported(&self.state.lent())
+    }
+
+    /// [`Trainer::to_cloud`] of another state of the model.
+    pub(crate) fn exported(&self, splats: &Splats) -> Result<GaussianCloud> {
+        let cloud = splats.to_cloud()?;
         let cloud = cloud.with_sh_degree(cloud.sh_degree.max(self.config.model.sh_degree));
         let valid: Vec<usize> = (0..cloud.len()).filter(|&i| cloud.is_row_valid(i)).collect();
         Ok(if valid.len() == cloud.len() { cloud } else { cloud.select(&valid) })
@@ -175,15 +253,22 @@ impl Trainer {
         let target = LossTarget::new(photo, background);
         stage_ms.image = clock.lap();
 
-        let options = RenderOptions { background, pass: Pass::Train, ..self.config.render_options() };
+        let stats = if self.scale_decay.is_some() { StatsMode::Tiles } else { StatsMode::None };
+        let options = RenderOptions { background, pass: Pass::Train, stats, ..self.config.render_options() };
         let leaves = tracked(&self.state.lent());
-        let rendered = render(&leaves, &self.images.views()[view].camera, &options)?;
+        let Rendered { image, splat_stats, .. } = render(&leaves, &self.images.views()[view].camera, &options)?;
         stage_ms.forward = clock.lap();
 
-        let pending = self.losses.evaluate(rendered.image, &target).expect("a trainer has a loss");
+        let pending = self.losses.evaluate(image, &target).expect("a trainer has a loss");
         stage_ms.loss = clock.lap();
 
-        let gradients = taken(leaves, pending.loss.backward());
+        let mut gradients = taken(leaves, pending.loss.backward());
+        if let Some(ScaleDecay { weight, scale_unit }) = self.scale_decay {
+            let log_scales = self.state.lent().log_scales;
+            let used = &splat_stats.tiles_used;
+            gradients.log_scales =
+                scale_decay::add_gradient(log_scales, gradients.log_scales, used, weight, scale_unit);
+        }
         stage_ms.backward = clock.lap();
 
         // On the CPU the values are there; a GPU is waited for only when somebody will see them.
@@ -230,9 +315,11 @@ impl Trainer {
     /// [`Error::NonFiniteLoss`] of the step that closed it; the trainer is then where it was before that step.
     fn checked_status(&mut self) -> Result<Status> {
         let status = self.state.status()?;
-        let Some((step, loss)) = status.failed else { return Ok(status) };
+        let Some((number, loss)) = status.failed else { return Ok(status) };
+        // The model may have gone back to an earlier state: its updates are then fewer than the steps.
+        let step = self.step + number - self.state.num_updates();
         self.step = step - 1;
-        self.state.reopen(step - 1);
+        self.state.reopen(number - 1);
         let view = self.view_at(step - 1);
         let suspect = Columns::from_splats(self.state.lent())?.most_suspect();
         Err(Error::NonFiniteLoss {

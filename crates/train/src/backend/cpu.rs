@@ -3,7 +3,9 @@
 
 use super::{AdamUpdate, Changed, NoiseUpdate, OptimOps, Refinement, State, Status};
 use crate::event::DensifyReport;
-use crate::kernels::cpu::{adam, noise::add_noise, regularize::regularize, relocate::refine, rows::Rows};
+use crate::kernels::cpu::{
+    adam, noise::add_noise, regularize::regularize, relocate::refine, rows::Rows, scale_decay::add_scale_decay,
+};
 use crate::optim::Columns;
 use burn::backend::{
     NdArray,
@@ -91,6 +93,17 @@ fn changed<B: HostTensors>(state: State<B>, change: impl FnOnce(&mut Rows)) -> C
     })
 }
 
+fn host_scale_decay<B: HostTensors>(
+    log_scales: &FloatTensor<B>,
+    mut gradients: FloatTensor<B>,
+    used: &IntTensor<B>,
+    factor: f32,
+) -> FloatTensor<B> {
+    let (log_scales, used) = (B::f32_slice(log_scales), B::i32_slice(used));
+    add_scale_decay(&log_scales, B::f32_slice_mut(&mut gradients), bytemuck::cast_slice(&used), factor);
+    gradients
+}
+
 /// The same host implementation serves every CPU backend.
 macro_rules! host_optim_ops {
     ($backend:ty) => {
@@ -115,6 +128,28 @@ macro_rules! host_optim_ops {
 
             fn sort_spatially(state: State<Self>, _center: [f32; 3], _half: f32) -> Changed<Self> {
                 changed(state, Rows::sort_spatially)
+            }
+
+            fn select_rows(state: State<Self>, rows: Vec<u32>) -> Changed<Self> {
+                changed(state, |state| state.reorder(&rows))
+            }
+
+            fn clamp_opacities(state: State<Self>, max_logit: f32, _shared: bool) -> Changed<Self> {
+                changed(state, |rows| rows.clamp_opacities(max_logit))
+            }
+
+            fn copied(state: State<Self>) -> Changed<Self> {
+                let num_gaussians = shape_of::<Self>(&state.params.opacity_logits)[0];
+                Changed { state, outcome: Ok(DensifyReport { num_gaussians, ..DensifyReport::default() }) }
+            }
+
+            fn add_scale_decay(
+                log_scales: FloatTensor<Self>,
+                gradients: FloatTensor<Self>,
+                used: IntTensor<Self>,
+                factor: f32,
+            ) -> FloatTensor<Self> {
+                host_scale_decay::<Self>(&log_scales, gradients, &used, factor)
             }
 
             fn widen_sh(state: State<Self>, num_coefficients: usize) -> Changed<Self> {

@@ -10,12 +10,13 @@ use crate::kernels::gpu::adam::{self, Packed};
 use crate::kernels::gpu::noise::add_noise;
 use crate::kernels::gpu::regularize::regularize;
 use crate::kernels::gpu::relocate::{PackedRows, refine};
-use crate::kernels::gpu::rows::{Listed, copied, morton_order, select_rows};
-use burn::backend::tensor::FloatTensor;
+use crate::kernels::gpu::rows::{Listed, clamp_opacities, copied, morton_order, select_rows};
+use crate::kernels::gpu::scale_decay::add_scale_decay;
+use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn_cubecl::{CubeBackend, tensor::CubeTensor};
 use gazesplat_render::Result;
 use gazesplat_render::backend::Parameters;
-use gazesplat_render::gpu::{Gpu, packed::PackedLayout};
+use gazesplat_render::gpu::{Gpu, contiguous, packed::PackedLayout};
 
 type GpuState = State<CubeBackend>;
 type GpuParameters = Parameters<CubeBackend>;
@@ -104,6 +105,41 @@ impl OptimOps for CubeBackend {
             let order = morton_order(gpu, &rows.layout, &rows.params, center, half)?;
             selected(gpu, &rows, rows.layout, &order, Listed::Only).map(unmoved)
         })
+    }
+
+    fn select_rows(state: GpuState, rows: Vec<u32>) -> Changed<Self> {
+        changed(state, false, |gpu, from, _| {
+            let new = PackedLayout::new(rows.len(), from.layout.num_coefficients);
+            let list = gpu.upload_u32(&rows, &[rows.len()]);
+            selected(gpu, &from, new, &list, Listed::Only).map(unmoved)
+        })
+    }
+
+    fn clamp_opacities(state: GpuState, max_logit: f32, shared: bool) -> Changed<Self> {
+        changed(state, shared, |gpu, rows, _| {
+            clamp_opacities(gpu, &rows.layout, &rows.params, &rows.first, &rows.second, max_logit);
+            Ok(unmoved(rows))
+        })
+    }
+
+    fn copied(state: GpuState) -> Changed<Self> {
+        changed(state, true, |gpu, mut rows, _| {
+            rows.first = copied(gpu, rows.first, rows.layout.len())?;
+            rows.second = copied(gpu, rows.second, rows.layout.len())?;
+            Ok(unmoved(rows))
+        })
+    }
+
+    fn add_scale_decay(
+        log_scales: FloatTensor<Self>,
+        gradients: FloatTensor<Self>,
+        used: IntTensor<Self>,
+        factor: f32,
+    ) -> FloatTensor<Self> {
+        let gpu = Gpu::of(&gradients);
+        let gradients = contiguous(gradients);
+        add_scale_decay(&gpu, &contiguous(log_scales), &gradients, &used, factor);
+        gradients
     }
 
     fn widen_sh(state: GpuState, num_coefficients: usize) -> Changed<Self> {

@@ -159,6 +159,25 @@ pub trait OptimOps: Backend {
     /// the means on a CPU, on a GPU by the cube of `half` world units around `center`, which needs no read-back.
     fn sort_spatially(#[extension_type] state: State<Self>, center: [f32; 3], half: f32) -> Changed<Self>;
 
+    /// Keeps the listed rows, in that order, with their moments; the others are gone.
+    fn select_rows(#[extension_type] state: State<Self>, rows: Vec<u32>) -> Changed<Self>;
+
+    /// Lowers opacity logits above `max_logit` to it, and forgets the moments of all opacities.
+    fn clamp_opacities(#[extension_type] state: State<Self>, max_logit: f32, shared: bool) -> Changed<Self>;
+
+    /// A state whose parameters and moments later operations on the given one leave as they are; the status stays shared. A
+    /// CPU backend copies what is shared when it is written to, so there it is the same.
+    fn copied(#[extension_type] state: State<Self>) -> Changed<Self>;
+
+    /// `gradients` of the log scales, `[N, 3]`, with `factor` times those of scale decay added (RTGS Eq. 5); `used`: tiles
+    /// each row is used in, `[N]`. On a GPU `gradients` is overwritten in place.
+    fn add_scale_decay(
+        log_scales: FloatTensor<Self>,
+        gradients: FloatTensor<Self>,
+        used: IntTensor<Self>,
+        factor: f32,
+    ) -> FloatTensor<Self>;
+
     /// Gives every row `num_coefficients` SH coefficients; new ones are zero, with zero moments.
     fn widen_sh(#[extension_type] state: State<Self>, num_coefficients: usize) -> Changed<Self>;
 }

@@ -3,6 +3,7 @@
 //! Values stay on the device until somebody asks for them: [`PendingLoss::read`] is the one place that waits for it.
 
 pub mod l1_ssim;
+pub mod scale_decay;
 
 pub use l1_ssim::L1Ssim;
 

@@ -6,7 +6,7 @@ pub mod state;
 
 pub use adam::{AdamSettings, Regularizers};
 pub use schedule::LearningRates;
-pub use state::ModelState;
+pub use state::{HostState, ModelState, Snapshot};
 
 use crate::error::Result;
 use crate::host::read;

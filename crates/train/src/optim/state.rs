@@ -4,6 +4,7 @@ use super::{AdamSettings, Columns, LearningRates, Regularizers};
 use crate::backend::{AdamUpdate, Changed, NoiseUpdate, OptimOps, Refinement, State, Status};
 use crate::error::Result;
 use crate::event::DensifyReport;
+use crate::kernels::cpu::rows::Rows;
 use burn::backend::Dispatch;
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use gazesplat_render::Splats;
@@ -11,6 +12,74 @@ use gazesplat_render::backend::Parameters;
 #[cfg(feature = "gpu")]
 use gazesplat_render::gpu::packed::PackedLayout;
 use std::sync::atomic::{AtomicBool, Ordering};
+
+/// A model with its optimiser as it was at some moment.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    tensors: State<Dispatch>,
+    num_updates: u32,
+}
+
+impl Snapshot {
+    /// Number of rows N.
+    pub fn num_rows(&self) -> usize {
+        Tensor::<1>::from_dispatch(self.tensors.params.opacity_logits.clone()).dims()[0]
+    }
+
+    /// The parameters, for a caller that changes nothing.
+    pub fn splats(&self) -> Splats {
+        splats(self.tensors.params.clone())
+    }
+
+    /// Reads everything back.
+    ///
+    /// # Errors
+    /// [`crate::Error::Render`] when the device does not answer.
+    pub fn to_host(&self) -> Result<HostState> {
+        let State { params, first, second, .. } = &self.tensors;
+        let [params, first, second] = [params, first, second].map(|p| Columns::from_splats(splats(p.clone())));
+        Ok(HostState { rows: Rows { params: params?, first: first?, second: second? }, num_updates: self.num_updates })
+    }
+
+    /// Uploads `state`.
+    ///
+    /// # Errors
+    /// As [`ModelState::new`].
+    pub fn from_host(state: HostState, device: &Device) -> Result<Self> {
+        let HostState { rows: Rows { params, first, second }, num_updates } = state;
+        check_size(&params, device)?;
+        let [params, first, second] = [params, first, second].map(|columns| dispatched(columns.into_splats(device)));
+        let status = status_tensor(Status::default(), device);
+        Ok(Self { tensors: State { params, first, second, status }, num_updates })
+    }
+}
+
+/// A snapshot on the host: what a checkpoint holds.
+#[derive(Debug, Clone, PartialEq)]
+pub struct HostState {
+    /// Parameters and moments.
+    pub rows: Rows,
+    /// Updates done.
+    pub num_updates: u32,
+}
+
+/// Refuses what a GPU takes in no single buffer.
+fn check_size(params: &Columns, device: &Device) -> Result<()> {
+    #[cfg(feature = "gpu")]
+    if let Some(gpu) = gazesplat_render::gpu::Gpu::from_device(device) {
+        let layout = PackedLayout::new(params.num_rows(), params.num_coefficients());
+        gpu.check_size("bytes of packed parameters", &[layout.len()], DType::F32)?;
+    }
+    #[cfg(not(feature = "gpu"))]
+    let _ = (params, device);
+    Ok(())
+}
+
+fn copied(state: State<Dispatch>) -> Result<State<Dispatch>> {
+    let Changed { state, outcome } = <Dispatch as OptimOps>::copied(state);
+    outcome?;
+    Ok(state)
+}
 
 /// Parameters and their optimiser, changed by one operation at a time.
 ///
@@ -32,11 +101,7 @@ impl ModelState {
     /// # Errors
     /// [`crate::Error::Render`] when a GPU takes no model of that size.
     pub fn new(params: Columns, settings: AdamSettings, device: &Device) -> Result<Self> {
-        #[cfg(feature = "gpu")]
-        if let Some(gpu) = gazesplat_render::gpu::Gpu::from_device(device) {
-            let layout = PackedLayout::new(params.num_rows(), params.num_coefficients());
-            gpu.check_size("bytes of packed parameters", &[layout.len()], DType::F32)?;
-        }
+        check_size(&params, device)?;
         let zeros = || dispatched(params.zeros_like().into_splats(device));
         let tensors = State {
             first: zeros(),
@@ -175,6 +240,49 @@ impl ModelState {
     /// As [`ModelState::update`].
     pub fn sort_spatially(&mut self, center: [f32; 3], half: f32) -> Result<()> {
         self.apply(|state, _| <Dispatch as OptimOps>::sort_spatially(state, center, half)).map(drop)
+    }
+
+    /// Keeps the listed rows, in that order, with their moments; the others are gone.
+    ///
+    /// # Errors
+    /// As [`ModelState::update`].
+    ///
+    /// # Panics
+    /// If `rows` names something that is not a row.
+    pub fn select_rows(&mut self, rows: Vec<u32>) -> Result<()> {
+        let num_rows = self.num_rows();
+        assert!(rows.iter().all(|&row| (row as usize) < num_rows), "rows of {num_rows} are selected");
+        self.apply(|state, _| <Dispatch as OptimOps>::select_rows(state, rows)).map(drop)
+    }
+
+    /// Lowers opacities above `max_opacity`, in (0, 1), to it, and forgets the moments of all opacities.
+    ///
+    /// # Errors
+    /// As [`ModelState::update`].
+    pub fn clamp_opacities(&mut self, max_opacity: f32) -> Result<()> {
+        let max_logit = (max_opacity / (1.0 - max_opacity)).ln();
+        self.apply(|state, shared| <Dispatch as OptimOps>::clamp_opacities(state, max_logit, shared)).map(drop)
+    }
+
+    /// A copy of parameters, moments and the number of updates, to go back to.
+    ///
+    /// # Errors
+    /// As [`ModelState::update`].
+    pub fn snapshot(&self) -> Result<Snapshot> {
+        Ok(Snapshot { tensors: copied(self.tensors().clone())?, num_updates: self.num_updates })
+    }
+
+    /// Goes back to `snapshot`, which stays as it is; a closed state is open again.
+    ///
+    /// # Errors
+    /// As [`ModelState::update`]; the state is then as it was.
+    pub fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let mut tensors = copied(snapshot.tensors.clone())?;
+        tensors.status = status_tensor(Status::default(), &self.device);
+        self.tensors = Some(tensors);
+        self.num_updates = snapshot.num_updates;
+        *self.is_handed_out.get_mut() = false;
+        Ok(())
     }
 
     /// Gives every row `num_coefficients` SH coefficients; new ones are zero, with zero moments.

@@ -66,6 +66,18 @@ impl Rows {
         self.reorder(&order);
     }
 
+    /// Lowers opacity logits above `max_logit` to it, and forgets the moments of all opacities; NaN stays.
+    pub fn clamp_opacities(&mut self, max_logit: f32) {
+        let g = Group::OpacityLogits as usize;
+        for logit in &mut self.params.data[g] {
+            if *logit > max_logit {
+                *logit = max_logit;
+            }
+        }
+        self.first.data[g].fill(0.0);
+        self.second.data[g].fill(0.0);
+    }
+
     /// Overwrites row `target` with row `source`; both lose their moments.
     ///
     /// # Panics

@@ -6,3 +6,4 @@ pub mod noise;
 pub mod regularize;
 pub mod relocate;
 pub mod rows;
+pub mod scale_decay;

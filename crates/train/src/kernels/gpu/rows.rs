@@ -191,6 +191,41 @@ fn copy_all(from: &[f32], to: &mut [f32], len: u32) {
     }
 }
 
+/// Lowers opacity logits above `max_logit` to it, and forgets the moments of all opacities; NaN stays. All three buffers
+/// are overwritten in place.
+pub fn clamp_opacities(
+    gpu: &Gpu,
+    layout: &PackedLayout,
+    params: &CubeTensor,
+    first: &CubeTensor,
+    second: &CubeTensor,
+    max_logit: f32,
+) {
+    clamp_rows::launch(
+        &gpu.client,
+        gpu.units(layout.num_rows),
+        cube_dim(),
+        params.clone().into_buffer_arg(),
+        first.clone().into_buffer_arg(),
+        second.clone().into_buffer_arg(),
+        layout.offsets[3] as u32,
+        max_logit,
+        layout.num_rows as u32,
+    );
+}
+
+#[cube(launch)]
+fn clamp_rows(params: &mut [f32], first: &mut [f32], second: &mut [f32], start: u32, max_logit: f32, num_rows: u32) {
+    if ABSOLUTE_POS < num_rows as usize {
+        let at = ABSOLUTE_POS + start as usize;
+        if params[at] > max_logit {
+            params[at] = max_logit;
+        }
+        first[at] = 0.0f32;
+        second[at] = 0.0f32;
+    }
+}
+
 /// Forgets the values of a row.
 #[cube]
 pub fn zero_row(values: &mut [f32], at: &Sections, row: u32) {

@@ -1,0 +1,178 @@
+//! Checkpoints: one file with everything an interrupted run needs to go on, complete or absent.
+//!
+//! The file is a safetensors file: tensors of parameters and moments, and a JSON text with the rest in its header. What the
+//! text holds is the business of who writes it; here it is bound to a kind of run and a version.
+
+use crate::error::{Error, Result};
+use crate::kernels::cpu::rows::Rows;
+use crate::optim::{Columns, Group, HostState};
+use gazesplat_core::io::write_atomically;
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use serde::{Serialize, de::DeserializeOwned};
+use std::collections::HashMap;
+use std::io::Write as _;
+use std::path::Path;
+
+/// Format of the tensors and of what every checkpoint holds.
+const FORMAT: &str = "gazesplat checkpoint 1";
+
+/// Writes a checkpoint of a run of kind `kind`: `meta` and the named states. A checkpoint that was there before stays
+/// until the new one is complete on the disk.
+///
+/// # Errors
+/// [`Error::Scene`] when the file cannot be written.
+pub fn save(path: &Path, kind: &str, meta: &impl Serialize, states: &[(&str, &HostState)]) -> Result<()> {
+    let mut info = HashMap::from([
+        ("format".to_owned(), FORMAT.to_owned()),
+        ("kind".to_owned(), kind.to_owned()),
+        ("meta".to_owned(), serde_json::to_string(meta).expect("our records are plain data")),
+    ]);
+    let mut tensors = Vec::new();
+    for (name, state) in states {
+        info.insert(format!("{name}.num_updates"), state.num_updates.to_string());
+        let Rows { params, first, second } = &state.rows;
+        for (part, columns) in [("params", params), ("first", first), ("second", second)] {
+            for group in Group::ALL {
+                let shape = vec![columns.num_rows(), columns.widths[group as usize]];
+                let view = TensorView::new(Dtype::F32, shape, bytemuck::cast_slice(columns.of(group)))
+                    .expect("columns have the size of their shape");
+                tensors.push((format!("{name}.{part}.{}", group.name()), view));
+            }
+        }
+    }
+    let bytes = safetensors::serialize(tensors, Some(info)).expect("finite shapes and plain text");
+    Ok(write_atomically(path, |file| file.write_all(&bytes))?)
+}
+
+/// A checkpoint, read.
+#[derive(Debug)]
+pub struct Loaded<M> {
+    /// What [`save`] was given.
+    pub meta: M,
+    states: Vec<(String, HostState)>,
+}
+
+impl<M> Loaded<M> {
+    /// Takes the state of that name out.
+    pub fn take(&mut self, name: &str) -> Option<HostState> {
+        let at = self.states.iter().position(|(found, _)| found == name)?;
+        Some(self.states.swap_remove(at).1)
+    }
+}
+
+/// Reads a checkpoint of a run of kind `kind` with the states `names`, as many of them as there are.
+///
+/// # Errors
+/// [`Error::Checkpoint`] for a file that is damaged, of another version or of another kind of run; [`Error::Scene`] when it
+/// cannot be read.
+pub fn load<M: DeserializeOwned>(path: &Path, kind: &str, names: &[&str]) -> Result<Loaded<M>> {
+    let refuse = |message: String| Error::Checkpoint { path: path.to_owned(), message };
+    let bytes = std::fs::read(path).map_err(|source| gazesplat_core::Error::Io {
+        action: "read",
+        path: path.to_owned(),
+        source,
+    })?;
+    let (_, header) = SafeTensors::read_metadata(&bytes).map_err(|e| refuse(format!("damaged: {e}")))?;
+    let file = SafeTensors::deserialize(&bytes).map_err(|e| refuse(format!("damaged: {e}")))?;
+    let none = HashMap::new();
+    let info = header.metadata().as_ref().unwrap_or(&none);
+    let text = |key: &str| info.get(key).map(String::as_str).unwrap_or_default();
+    if text("format") != FORMAT {
+        return Err(refuse(format!("its format is `{}`, expected `{FORMAT}`", text("format"))));
+    }
+    if text("kind") != kind {
+        return Err(refuse(format!("it is of a run of `{}`, expected `{kind}`", text("kind"))));
+    }
+    let meta = serde_json::from_str(text("meta")).map_err(|e| refuse(format!("of another version: {e}")))?;
+    let mut states = Vec::new();
+    for &name in names {
+        let Some(num_updates) = info.get(&format!("{name}.num_updates")) else { continue };
+        let num_updates = num_updates.parse().map_err(|e| refuse(format!("damaged: updates of `{name}`: {e}")))?;
+        let part = |part: &str| columns(&file, &format!("{name}.{part}")).map_err(&refuse);
+        let rows = Rows { params: part("params")?, first: part("first")?, second: part("second")? };
+        if rows.params.widths != rows.first.widths
+            || rows.params.widths != rows.second.widths
+            || rows.params.num_rows() != rows.first.num_rows()
+            || rows.params.num_rows() != rows.second.num_rows()
+        {
+            return Err(refuse(format!("damaged: the moments of `{name}` do not fit its parameters")));
+        }
+        states.push((name.to_owned(), HostState { rows, num_updates }));
+    }
+    Ok(Loaded { meta, states })
+}
+
+/// Parameters, or moments of them, under `prefix`.
+fn columns(file: &SafeTensors<'_>, prefix: &str) -> std::result::Result<Columns, String> {
+    let mut columns = Columns::default();
+    let mut num_rows = None;
+    for group in Group::ALL {
+        let name = format!("{prefix}.{}", group.name());
+        let tensor = file.tensor(&name).map_err(|e| format!("damaged: {e}"))?;
+        let shape = tensor.shape();
+        let expected_width = match group {
+            Group::Means | Group::LogScales => Some(3),
+            Group::Quats => Some(4),
+            Group::OpacityLogits => Some(1),
+            Group::Sh => None,
+        };
+        let fits = tensor.dtype() == Dtype::F32
+            && shape.len() == 2
+            && num_rows.is_none_or(|n| n == shape[0])
+            && expected_width.map_or_else(|| shape[1] % 3 == 0 && shape[1] > 0, |w| w == shape[1]);
+        if !fits {
+            return Err(format!("damaged: `{name}` is {:?} {shape:?}", tensor.dtype()));
+        }
+        num_rows = Some(shape[0]);
+        columns.widths[group as usize] = shape[1];
+        columns.data[group as usize] = tensor.data().chunks_exact(4).map(float).collect();
+    }
+    Ok(columns)
+}
+
+fn float(bytes: &[u8]) -> f32 {
+    f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn state() -> HostState {
+        let widths = [3, 4, 3, 1, 12];
+        let columns = |add: f32| Columns { data: widths.map(|w| (0..2 * w).map(|i| i as f32 + add).collect()), widths };
+        let rows = Rows { params: columns(0.25), first: columns(f32::MIN_POSITIVE), second: columns(f32::EPSILON) };
+        HostState { rows, num_updates: 7 }
+    }
+
+    #[test]
+    fn what_is_saved_comes_back_bit_for_bit() {
+        let dir = tempfile::tempdir().expect("temporary directory");
+        let path = dir.path().join("checkpoint");
+        save(&path, "test", &(3u32, "text"), &[("state", &state()), ("best", &state())]).expect("writable");
+        let mut loaded: Loaded<(u32, String)> = load(&path, "test", &["state", "best", "none"]).expect("readable");
+        assert_eq!(loaded.meta, (3, "text".to_owned()));
+        assert_eq!(loaded.take("state"), Some(state()));
+        assert_eq!(loaded.take("best"), Some(state()));
+        assert_eq!(loaded.take("none"), None);
+    }
+
+    #[test]
+    fn damaged_and_foreign_files_are_refused_with_the_reason() {
+        let dir = tempfile::tempdir().expect("temporary directory");
+        let path = dir.path().join("checkpoint");
+        let refused = |kind: &str| load::<(u32, String)>(&path, kind, &["state"]).expect_err("refused").to_string();
+        assert!(refused("test").contains("cannot read"), "{}", refused("test"));
+        save(&path, "test", &(3u32, "text"), &[("state", &state())]).expect("writable");
+        assert!(refused("other").contains("of a run of `test`, expected `other`"));
+        let bytes = std::fs::read(&path).expect("readable");
+        for len in [0, 7, 8, 100, bytes.len() / 2, bytes.len() - 1] {
+            std::fs::write(&path, &bytes[..len]).expect("writable");
+            assert!(refused("test").contains("damaged"), "{len}: {}", refused("test"));
+        }
+        std::fs::write(&path, b"not a checkpoint at all, but a text").expect("writable");
+        assert!(refused("test").contains("damaged"));
+        save(&path, "test", &"another version", &[("state", &state())]).expect("writable");
+        assert!(refused("test").contains("of another version"));
+    }
+}

@@ -75,7 +75,7 @@ pub fn load_scene(scene: &Path, config: &Config, console: &Console) -> Result<Da
         max_side: config.data.max_side,
         images: config.data.images.clone(),
         test_every: config.data.test_every,
-        ..LoadOptions::default()
+        holdout: config.data.holdout,
     };
     let dataset = Dataset::load(scene, &options)?;
     for warning in &dataset.warnings {

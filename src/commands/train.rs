@@ -119,9 +119,10 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     let started = Instant::now();
     let dataset = load_scene(job.scene, config, console)?;
     console.note(format_args!(
-        "{}: {} training views, {} test views, {} points",
+        "{}: {} training views{}, {} test views, {} points",
         scene_name(job.scene),
         dataset.train.len(),
+        held_out(&dataset),
         dataset.test.len(),
         grouped(dataset.points.positions.len())
     ));
@@ -248,6 +249,14 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     Ok(Trained { run_dir, dataset, cloud, num_steps, eval, report })
 }
 
+/// How many views are kept out of gradient steps, to stand behind the number of training views; nothing for none.
+fn held_out(dataset: &Dataset) -> String {
+    match dataset.holdout.len() {
+        0 => String::new(),
+        n => format!(" and {n} held out of training"),
+    }
+}
+
 /// Decodes what fits into the cache, so that an image that cannot be read ends the run before it begins.
 fn preload(images: &ImageCache, console: &Console) -> Result<()> {
     let bar = progress::counting_bar(console, "reading images", images.len());
@@ -271,7 +280,10 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
 fn facts(job: &TrainJob<'_>, dataset: &Dataset, run_dir: &RunDir) -> Vec<(String, String)> {
     let mut facts = vec![
         ("scene".to_owned(), job.scene.display().to_string()),
-        ("views".to_owned(), format!("{} for training, {} for testing", dataset.train.len(), dataset.test.len())),
+        (
+            "views".to_owned(),
+            format!("{} for training{}, {} for testing", dataset.train.len(), held_out(dataset), dataset.test.len()),
+        ),
     ];
     if let Some(view) = dataset.train.first() {
         let pinhole = view.camera.intrinsics;

@@ -38,6 +38,17 @@ fn run_says_where_it_was_computed() {
 }
 
 #[test]
+fn views_held_out_are_said_and_recorded() {
+    let place = Place::with_scene();
+    let said = train(&place, &["--out", "run", "--set", "data.holdout=every8"]).done().stderr;
+    assert!(said.contains("6 training views and 1 held out of training, 2 test views"), "{said}");
+    assert!(place.read("run/settings.toml").contains("holdout = \"every8\""));
+    assert!(place.read("run/report.html").contains("6 for training and 1 held out of training, 2 for testing"));
+    let said = train(&place, &["--out", "no", "--set", "data.holdout=every4"]).refused();
+    assert!(said.contains("`data.holdout`") && said.contains("`every8`"), "{said}");
+}
+
+#[test]
 fn evaluation_has_the_promised_fields() {
     let place = Place::with_run();
     let eval: Value = serde_json::from_str(&place.read("run/eval.json")).expect("JSON");

@@ -3,6 +3,7 @@
 //! Keys with a step count say how they behave in runs shorter than the 30,000 steps the published defaults are made for.
 
 use crate::error::{Error, Result};
+pub use gazesplat_core::dataset::Holdout;
 use gazesplat_render::RenderOptions;
 use serde::{Deserialize, Serialize};
 
@@ -77,6 +78,9 @@ pub struct DataSection {
     pub images: Option<String>,
     /// Every n-th view in name order, from the first, is a test view; 0 = all views train. Default 8 (3DGS).
     pub test_every: u32,
+    /// Training views kept out of gradient steps, for a guard that judges the model later: `"none"`, or `"every8"`, those
+    /// whose index among the training views in name order is 4 modulo 8. Default `"none"`.
+    pub holdout: Holdout,
     /// Bytes of decoded images kept in memory. Default 4 GiB.
     pub cache_bytes: usize,
     /// What shows through transparent pixels of images and where no Gaussian is:
@@ -86,7 +90,14 @@ pub struct DataSection {
 
 impl Default for DataSection {
     fn default() -> Self {
-        Self { max_side: 1600, images: None, test_every: 8, cache_bytes: 4 << 30, background: Background::default() }
+        Self {
+            max_side: 1600,
+            images: None,
+            test_every: 8,
+            holdout: Holdout::None,
+            cache_bytes: 4 << 30,
+            background: Background::default(),
+        }
     }
 }
 

@@ -4,7 +4,7 @@
 
 use burn::tensor::Device;
 use gazesplat_core::GaussianCloud;
-use gazesplat_core::dataset::{Dataset, SparsePoints};
+use gazesplat_core::dataset::{Dataset, Holdout, LoadOptions, SparsePoints};
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::synthetic::{SynthOptions, write_scene};
 use gazesplat_render::{cpu_device, device::gpu_device};
@@ -96,6 +96,23 @@ impl Observer for Log {
         }
         Ok(())
     }
+}
+
+#[test]
+fn views_held_out_of_training_are_seen_by_no_step() {
+    let (scratch, whole) = scene("holdout", 16);
+    let options = LoadOptions { holdout: Holdout::Every8, ..LoadOptions::default() };
+    let dataset = Dataset::load(&scratch.0, &options).unwrap();
+    let names = |views: &[gazesplat_core::View]| views.iter().map(|v| v.name.clone()).collect::<Vec<_>>();
+    // 14 training views: indices 4 and 12 of them.
+    let expected = [4, 12].map(|i| whole.train[i].name.clone());
+    assert_eq!(names(&dataset.holdout), expected);
+    let mut trainer = trainer(&dataset, &config(24, 1000));
+    let mut visited: Vec<String> = (0..24).map(|_| trainer.step().unwrap().view).collect();
+    visited.sort();
+    visited.dedup();
+    assert_eq!(visited, names(&dataset.train), "two epochs visit every other training view");
+    assert_eq!(dataset.train.len(), 12);
 }
 
 #[test]

@@ -3,30 +3,25 @@
 //!
 //! One workgroup computes 16 × 16 pixels, one per unit; its windows reach 5 pixels beyond, so it loads 26 × 26 into
 //! workgroup memory, channel after channel, and windows them along columns first, then along rows. Two passes over the
-//! image: [`ssim_pass`] forms the moments, SSIM and its derivatives by them, and the workgroup's sums of |x − y| and of
-//! SSIM; [`gradient_pass`] windows the derivatives. One workgroup then adds the sums. Every sum has a fixed order.
+//! image: `ssim_pass` forms the moments, SSIM and its derivatives by them, and the workgroup's sums of |x − y| and of
+//! SSIM; `gradient_pass` windows the derivatives. One workgroup then adds the sums. Every sum has a fixed order.
 //!
 //! **Ends.** Pixels outside the image are zero and have no weight; workgroups beyond the last tile lie outside entirely
 //! and write nothing. NaN in an unmasked pixel gives a NaN loss. A fully masked or empty image has L1 0, SSIM 1 and no
 //! gradient, and launches no pass.
 
-use crate::kernels::cpu::l1_ssim::{C1, C2, LANE_L1, LANE_LOSS, LANE_SSIM, RADIUS, Similarity, TAPS, WINDOW, Weights};
+mod windows;
+
+use crate::kernels::cpu::l1_ssim::{C1, C2, LANE_L1, LANE_LOSS, LANE_SSIM, RADIUS, Similarity, Weights};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 use gazesplat_render::Result;
-use gazesplat_render::gpu::{Gpu, UNITS, cube_dim};
-
-/// Side of the tile of a workgroup, pixels.
-const TILE: usize = 16;
-/// Side of what its windows reach.
-const HALO: usize = TILE + 2 * RADIUS;
-/// Pixels that its windows reach.
-const REACHED: usize = HALO * HALO;
-/// Values windowed along columns: 16 rows of 26.
-const WINDOWED: usize = TILE * HALO;
-/// Units, as a length.
-const NUM_UNITS: usize = UNITS as usize;
+use gazesplat_render::gpu::{Gpu, cube_dim};
+use windows::{
+    BLURRED, HALO, NUM_UNITS, REACHED, TILE, TILE_PIXELS, blur_maps, blur_moments, blur_rows, is_masked, own_tile,
+    place_of, reduced, target_value,
+};
 
 /// How a target is stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -184,59 +179,6 @@ fn run_packed(gpu: &Gpu, comparison: &Comparison, sums: &CubeTensor, ssim_weight
     Ok(packed_values)
 }
 
-/// Where value `i` of a tile's reach lies: its pixel, and whether the image has it.
-#[derive(CubeType)]
-struct Place {
-    pixel: usize,
-    in_image: bool,
-}
-
-/// Column and row are counted from the upper left corner of the reach, which lies 5 pixels outside the tile.
-#[cube]
-fn place_of(column: usize, row: usize, width: u32, height: u32) -> Place {
-    let (width, height) = (width as usize, height as usize);
-    let tiles_across = width.div_ceil(TILE);
-    let x = CUBE_POS % tiles_across * TILE + column;
-    let y = CUBE_POS / tiles_across * TILE + row;
-    let in_image = x >= RADIUS && y >= RADIUS && x < width + RADIUS && y < height + RADIUS;
-    let pixel = select(in_image, (y - RADIUS) * width + x - RADIUS, 0usize);
-    Place { pixel, in_image }
-}
-
-/// A component of the target's colour on the scale 0..1.
-#[cube]
-fn target_value(target: &[u32], pixel: usize, channel: u32, #[comptime] format: TargetFormat) -> f32 {
-    if comptime![format == TargetFormat::Floats] {
-        f32::reinterpret(target[pixel * 3 + channel as usize])
-    } else {
-        f32::cast_from((target[pixel] >> (8 * channel)) & 0xffu32) * (1.0_f32 / 255.0_f32)
-    }
-}
-
-/// True if the pixel carries no loss.
-#[cube]
-fn is_masked(target: &[u32], pixel: usize, #[comptime] format: TargetFormat) -> bool {
-    if comptime![format == TargetFormat::Floats] { false.runtime() } else { (target[pixel] >> 24u32) == 0u32 }
-}
-
-/// Sum over the units of a workgroup, by halves; every unit must call it. `shared` holds one value per unit.
-#[cube]
-fn reduced(shared: &mut Shared<[f32]>, value: f32) -> f32 {
-    let unit = UNIT_POS as usize;
-    sync_cube();
-    shared[unit] = value;
-    sync_cube();
-    let mut half = (NUM_UNITS / 2).runtime();
-    while half > 0 {
-        if unit < half {
-            shared[unit] = shared[unit] + shared[unit + half];
-        }
-        sync_cube();
-        half /= 2;
-    }
-    shared[0]
-}
-
 /// SSIM of a tile and, where wanted, its derivatives by μx, q and p, `[3, height, width]` each, zero at masked pixels.
 #[cube(launch)]
 fn ssim_pass(
@@ -253,12 +195,14 @@ fn ssim_pass(
     #[comptime] format: TargetFormat,
     #[comptime] with_maps: bool,
 ) {
-    let mut raw_x = Shared::<[f32]>::new_slice(REACHED);
-    let mut raw_y = Shared::<[f32]>::new_slice(REACHED);
-    let mut blurred = Shared::<[f32]>::new_slice(4 * WINDOWED);
+    let mut raw = Shared::<[f32]>::new_slice(2 * REACHED);
+    let mut blurred = Shared::<[f32]>::new_slice(4 * BLURRED);
+    let mut windowed = Shared::<[f32]>::new_slice(4 * TILE_PIXELS);
     let unit = UNIT_POS as usize;
     let (column, row) = (unit % TILE, unit / TILE);
-    let own = place_of(column + RADIUS, row + RADIUS, width, height);
+    let own_at = (row + RADIUS) * HALO + column + RADIUS;
+    let tile = own_tile(width);
+    let own = place_of(own_at, &tile, width, height);
     let mut is_valid = own.in_image;
     if own.in_image {
         is_valid = !is_masked(target, own.pixel, format);
@@ -269,7 +213,7 @@ fn ssim_pass(
         // 1. Both images, zero outside; masked pixels take the target's colour.
         let mut i = unit;
         while i < REACHED {
-            let place = place_of(i % HALO, i / HALO, width, height);
+            let place = place_of(i, &tile, width, height);
             let mut x = 0.0_f32;
             let mut y = 0.0_f32;
             if place.in_image {
@@ -279,52 +223,23 @@ fn ssim_pass(
                     x = image[place.pixel * channels as usize + channel as usize];
                 }
             }
-            raw_x[i] = x;
-            raw_y[i] = y;
+            raw[i] = x;
+            raw[REACHED + i] = y;
             i += NUM_UNITS;
         }
         sync_cube();
-        // 2. Windows along columns of x, y, x² + y² and xy.
-        let mut i = unit;
-        while i < WINDOWED {
-            let mut a = 0.0_f32;
-            let mut b = 0.0_f32;
-            let mut q = 0.0_f32;
-            let mut p = 0.0_f32;
-            #[unroll]
-            for k in 0..TAPS {
-                let w = comptime![WINDOW[k]];
-                let x = raw_x[i + k * HALO];
-                let y = raw_y[i + k * HALO];
-                a += w * x;
-                b += w * y;
-                q += w * x * x + w * y * y;
-                p += w * x * y;
-            }
-            blurred[i] = a;
-            blurred[WINDOWED + i] = b;
-            blurred[2 * WINDOWED + i] = q;
-            blurred[3 * WINDOWED + i] = p;
-            i += NUM_UNITS;
-        }
-        let at = (row + RADIUS) * HALO + column + RADIUS;
-        let difference = f32::abs(raw_x[at] - raw_y[at]);
-        // From here on the raw values are free for the next channel.
+        // 2. Windows along columns. What a unit reads here, the next channel overwrites after a barrier only.
+        blur_moments(&raw, &mut blurred);
+        let difference = f32::abs(raw[own_at] - raw[REACHED + own_at]);
         sync_cube();
-        // 3. Windows along rows, SSIM, its derivatives.
-        let mut mx = 0.0_f32;
-        let mut my = 0.0_f32;
-        let mut q = 0.0_f32;
-        let mut p = 0.0_f32;
-        #[unroll]
-        for k in 0..TAPS {
-            let w = comptime![WINDOW[k]];
-            let i = row * HALO + column + k;
-            mx += w * blurred[i];
-            my += w * blurred[WINDOWED + i];
-            q += w * blurred[2 * WINDOWED + i];
-            p += w * blurred[3 * WINDOWED + i];
-        }
+        // 3. Windows along rows.
+        blur_rows(&blurred, &mut windowed, 4usize);
+        sync_cube();
+        // 4. SSIM, its derivatives.
+        let mx = windowed[unit];
+        let my = windowed[TILE_PIXELS + unit];
+        let q = windowed[2 * TILE_PIXELS + unit];
+        let p = windowed[3 * TILE_PIXELS + unit];
         let both = mx * my;
         let means = mx * mx + my * my;
         let a1 = 2.0_f32 * both + C1;
@@ -338,6 +253,7 @@ fn ssim_pass(
             ssim_sum += s;
         }
         if comptime![with_maps] {
+            let to = channel as usize * (width * height) as usize + own.pixel;
             if own.in_image {
                 let mut by_mu = 0.0_f32;
                 let mut by_q = 0.0_f32;
@@ -347,19 +263,17 @@ fn ssim_pass(
                     by_q = -s * (b1 * inverse);
                     by_p = 2.0_f32 * (a1 * inverse);
                 }
-                let to = channel as usize * (width * height) as usize + own.pixel;
                 v_mu[to] = by_mu;
                 v_q[to] = by_q;
                 v_p[to] = by_p;
             }
         }
     }
-    // 4. Sums of the tile.
-    let l1_total = reduced(&mut raw_x, l1_sum);
-    let ssim_total = reduced(&mut raw_y, ssim_sum);
+    // 5. Sums of the tile.
+    let total = reduced(&mut raw, l1_sum, ssim_sum);
     if unit == 0 && CUBE_POS < num_tiles as usize {
-        sums[CUBE_POS] = l1_total;
-        sums[num_tiles as usize + CUBE_POS] = ssim_total;
+        sums[CUBE_POS] = total.l1;
+        sums[num_tiles as usize + CUBE_POS] = total.ssim;
     }
 }
 
@@ -380,16 +294,19 @@ fn gradient_pass(
     #[comptime] format: TargetFormat,
 ) {
     let mut maps = Shared::<[f32]>::new_slice(3 * REACHED);
-    let mut blurred = Shared::<[f32]>::new_slice(3 * WINDOWED);
+    let mut blurred = Shared::<[f32]>::new_slice(3 * BLURRED);
+    let mut windowed = Shared::<[f32]>::new_slice(3 * TILE_PIXELS);
     let unit = UNIT_POS as usize;
     let (column, row) = (unit % TILE, unit / TILE);
-    let own = place_of(column + RADIUS, row + RADIUS, width, height);
+    let own_at = (row + RADIUS) * HALO + column + RADIUS;
+    let tile = own_tile(width);
+    let own = place_of(own_at, &tile, width, height);
     let plane = (width * height) as usize;
     for channel in 0..3u32 {
         // 1. The derivatives, zero outside the image.
         let mut i = unit;
         while i < REACHED {
-            let place = place_of(i % HALO, i / HALO, width, height);
+            let place = place_of(i, &tile, width, height);
             let mut mu = 0.0_f32;
             let mut q = 0.0_f32;
             let mut p = 0.0_f32;
@@ -406,36 +323,15 @@ fn gradient_pass(
         }
         sync_cube();
         // 2. Windows along columns.
-        let mut i = unit;
-        while i < WINDOWED {
-            let mut mu = 0.0_f32;
-            let mut q = 0.0_f32;
-            let mut p = 0.0_f32;
-            #[unroll]
-            for k in 0..TAPS {
-                let w = comptime![WINDOW[k]];
-                mu += w * maps[i + k * HALO];
-                q += w * maps[REACHED + i + k * HALO];
-                p += w * maps[2 * REACHED + i + k * HALO];
-            }
-            blurred[i] = mu;
-            blurred[WINDOWED + i] = q;
-            blurred[2 * WINDOWED + i] = p;
-            i += NUM_UNITS;
-        }
+        blur_maps(&maps, &mut blurred);
         sync_cube();
-        // 3. Windows along rows, the gradient.
-        let mut mu = 0.0_f32;
-        let mut q = 0.0_f32;
-        let mut p = 0.0_f32;
-        #[unroll]
-        for k in 0..TAPS {
-            let w = comptime![WINDOW[k]];
-            let i = row * HALO + column + k;
-            mu += w * blurred[i];
-            q += w * blurred[WINDOWED + i];
-            p += w * blurred[2 * WINDOWED + i];
-        }
+        // 3. Windows along rows.
+        blur_rows(&blurred, &mut windowed, 3usize);
+        sync_cube();
+        // 4. The gradient.
+        let mu = windowed[unit];
+        let q = windowed[TILE_PIXELS + unit];
+        let p = windowed[2 * TILE_PIXELS + unit];
         if own.in_image {
             let to = own.pixel * channels as usize + channel as usize;
             let mut v = 0.0_f32;
@@ -453,7 +349,7 @@ fn gradient_pass(
             v_image[to] = v;
         }
     }
-    // 4. What carries no loss.
+    // 5. What carries no loss.
     if own.in_image {
         for channel in 3..channels {
             v_image[own.pixel * channels as usize + channel as usize] = 0.0_f32;
@@ -464,7 +360,7 @@ fn gradient_pass(
 /// Loss, L1 and SSIM of the sums of all tiles; one workgroup.
 #[cube(launch)]
 fn packed(sums: &[f32], packed: &mut [f32], num_tiles: u32, norm: f32, ssim_weight: f32) {
-    let mut shared = Shared::<[f32]>::new_slice(NUM_UNITS);
+    let mut shared = Shared::<[f32]>::new_slice(2 * NUM_UNITS);
     let mut l1_sum = 0.0_f32;
     let mut ssim_sum = 0.0_f32;
     let mut tile = UNIT_POS as usize;
@@ -473,8 +369,9 @@ fn packed(sums: &[f32], packed: &mut [f32], num_tiles: u32, norm: f32, ssim_weig
         ssim_sum += sums[num_tiles as usize + tile];
         tile += NUM_UNITS;
     }
-    let l1 = reduced(&mut shared, l1_sum) * norm;
-    let ssim = reduced(&mut shared, ssim_sum) * norm;
+    let total = reduced(&mut shared, l1_sum, ssim_sum);
+    let l1 = total.l1 * norm;
+    let ssim = total.ssim * norm;
     if UNIT_POS == 0 && CUBE_POS == 0 {
         packed[LANE_LOSS] = (1.0_f32 - ssim_weight) * l1 + ssim_weight * (1.0_f32 - ssim);
         packed[LANE_L1] = l1;

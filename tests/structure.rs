@@ -77,10 +77,12 @@ fn core_knows_no_tensors_and_libraries_no_command_line() {
 
 #[test]
 fn cpu_and_gpu_kernels_have_the_same_files() {
+    // Only the files of the directory itself: a folder of a kernel's name holds parts of it, which need no twin.
     let names = |dir: &Path| -> BTreeSet<PathBuf> {
-        rust_files(dir).into_iter().map(|p| p.strip_prefix(dir).expect("below dir").to_owned()).collect()
+        let below = rust_files(dir).into_iter().map(|p| p.strip_prefix(dir).expect("below dir").to_owned());
+        below.filter(|p| p.components().count() == 1).collect()
     };
-    for crate_name in ["render", "fovea"] {
+    for crate_name in ["render", "train", "fovea"] {
         let kernels = root().join("crates").join(crate_name).join("src/kernels");
         let (cpu, gpu) = (kernels.join("cpu"), kernels.join("gpu"));
         if gpu.is_dir() {

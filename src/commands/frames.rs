@@ -16,7 +16,7 @@ pub(crate) type NamedCamera = (String, Camera);
 pub(crate) fn draw(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<(RgbImage8, RenderStats)> {
     let rendered = gazesplat_render::render(splats, camera, options)?;
     let stats = rendered.stats;
-    Ok((rgb(rendered).to_rgb8(), stats))
+    Ok((rgb(rendered)?.to_rgb8(), stats))
 }
 
 /// Writes the frame of every camera into `<stem>.png` below `dir`.

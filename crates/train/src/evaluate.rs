@@ -1,6 +1,7 @@
 //! Quality of a model on views it has not been trained on.
 
 use crate::error::Result;
+use crate::host::read;
 use crate::losses::LossTarget;
 use crate::metrics;
 use gazesplat_core::image::ImageF32;
@@ -36,7 +37,7 @@ pub struct EvalReport {
 /// `each` gets the score and the render, `[H, W, 3]` unclamped, of every view in order.
 ///
 /// # Errors
-/// When a photograph cannot be read, or the renderer refuses.
+/// When a photograph cannot be read, the renderer refuses, or the device stopped.
 pub fn evaluate(
     splats: &Splats,
     images: &ImageCache,
@@ -46,7 +47,7 @@ pub fn evaluate(
     let mut views = Vec::with_capacity(images.len());
     for (index, view) in images.views().iter().enumerate() {
         let target = LossTarget::new(images.get(index)?, options.background);
-        let image = rgb(render(splats, &view.camera, options)?);
+        let image = rgb(render(splats, &view.camera, options)?)?;
         let score = ViewScore {
             name: view.name.clone(),
             psnr: metrics::psnr(&image, &target),
@@ -59,10 +60,13 @@ pub fn evaluate(
     Ok(EvalReport { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), num_gaussians: splats.len(), views })
 }
 
-/// The colours of a frame, `[H, W, 3]`.
-pub fn rgb(rendered: Rendered) -> ImageF32 {
+/// The colours of a frame, `[H, W, 3]`, on the host.
+///
+/// # Errors
+/// [`crate::Error::Render`] when a GPU was lost, has no memory left, or refused a kernel on the way.
+pub fn rgb(rendered: Rendered) -> Result<ImageF32> {
     let [height, width, channels] = rendered.image.dims();
-    let values = crate::optim::into_vec(rendered.image);
+    let values = read(rendered.image)?;
     let data = values.chunks_exact(channels).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect();
-    ImageF32 { width: width as u32, height: height as u32, data }
+    Ok(ImageF32 { width: width as u32, height: height as u32, data })
 }

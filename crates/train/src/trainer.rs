@@ -168,14 +168,15 @@ impl Trainer {
         let rendered = render(&leaves, &self.images.views()[view].camera, &options)?;
         stage_ms.forward = clock.lap();
 
-        let (loss, report) = self.losses.evaluate(rendered.image, &target).expect("a trainer has a loss");
+        let pending = self.losses.evaluate(rendered.image, &target).expect("a trainer has a loss");
+        let report = pending.read()?;
         if !report.total.is_finite() {
-            drop((loss, leaves));
+            drop((pending, leaves));
             return Err(self.non_finite(view, report.total));
         }
         stage_ms.loss = clock.lap();
 
-        let mut gradients = loss.backward();
+        let mut gradients = pending.loss.backward();
         let Splats { means, quats, log_scales, opacity_logits, sh } = leaves;
         let mut grads = Columns {
             data: [

@@ -1,13 +1,13 @@
 //! Losses between a rendered image and a photograph: terms of a weighted sum, each with its report.
+//!
+//! Values stay on the device until somebody asks for them: [`PendingLoss::read`] is the one place that waits for it.
 
 pub mod l1_ssim;
-pub mod ssim_kernel;
-mod ssim_rows;
-#[cfg(test)]
-mod ssim_tests;
 
 pub use l1_ssim::L1Ssim;
 
+use crate::error::Result;
+use crate::host::read;
 use burn::tensor::Tensor;
 use gazesplat_core::image::RgbImage8;
 use gazesplat_core::io::images::TrainingImage;
@@ -68,19 +68,51 @@ impl LossTerms {
     }
 }
 
-/// A differentiable value of an image and its report.
+/// A differentiable value of an image and what its report will be made of.
 #[derive(Debug)]
 pub struct ImageLossValue {
     /// `[1]`, on the graph of the image.
     pub loss: Tensor<1>,
-    /// The terms it is made of, unweighted.
-    pub terms: Vec<LossTerm>,
+    /// The terms it is made of, unweighted, off the graph; as many as `names`.
+    pub terms: Tensor<1>,
+    /// Names of the terms, as in logs.
+    pub names: &'static [&'static str],
 }
 
 /// A loss between a rendered image and a photograph.
 pub trait ImageLoss: Send {
-    /// The value for `image`, `[H, W, 4 or 5]`: RGB over the background, alpha, depth if there is a fifth channel.
+    /// The value for `image`, `[H, W, 4 or 5]`: RGB over the background, alpha, depth if there is a fifth channel. It
+    /// must not wait for the device.
     fn evaluate(&self, image: Tensor<3>, target: &LossTarget) -> ImageLossValue;
+}
+
+/// A loss on its device, and its report for when somebody asks.
+#[derive(Debug)]
+pub struct PendingLoss {
+    /// The weighted sum that is minimised, `[1]` on the graph of the image.
+    pub loss: Tensor<1>,
+    total: Tensor<1>,
+    /// Values of terms and their names, one entry per loss.
+    parts: Vec<(Tensor<1>, &'static [&'static str])>,
+}
+
+impl PendingLoss {
+    /// The weighted sum, `[1]` off the graph: for what looks at it on the device.
+    pub fn total(&self) -> Tensor<1> {
+        self.total.clone()
+    }
+
+    /// Waits for the device and reads the report, in one transfer. The graph need not exist any more.
+    ///
+    /// # Errors
+    /// [`crate::Error::Render`] when a GPU was lost, has no memory left, or refused a kernel on the way.
+    pub fn read(&self) -> Result<LossTerms> {
+        let parts = self.parts.iter().map(|(values, _)| values.clone());
+        let values = read(Tensor::cat(std::iter::once(self.total()).chain(parts).collect(), 0))?;
+        let names = self.parts.iter().flat_map(|(_, names)| names.iter());
+        let terms = names.zip(&values[1..]).map(|(&name, &value)| LossTerm { name, value }).collect();
+        Ok(LossTerms { total: values[0], terms })
+    }
 }
 
 /// A weighted sum of image losses.
@@ -96,21 +128,20 @@ impl WeightedLosses {
         self
     }
 
-    /// The sum, `[1]` on the graph of the image, and its terms; `None` when there is no loss to sum.
-    pub fn evaluate(&self, image: Tensor<3>, target: &LossTarget) -> Option<(Tensor<1>, LossTerms)> {
+    /// The sum for `image` and what its report will be made of; `None` when there is no loss to sum.
+    pub fn evaluate(&self, image: Tensor<3>, target: &LossTarget) -> Option<PendingLoss> {
         let mut sum: Option<Tensor<1>> = None;
-        let mut report = LossTerms::default();
+        let mut parts = Vec::with_capacity(self.losses.len());
         for (weight, loss) in &self.losses {
             let value = loss.evaluate(image.clone(), target);
-            report.terms.extend(value.terms);
+            parts.push((value.terms, value.names));
             let weighted = if *weight == 1.0 { value.loss } else { value.loss.mul_scalar(*weight) };
             sum = Some(match sum {
                 Some(sum) => sum + weighted,
                 None => weighted,
             });
         }
-        let sum = sum?;
-        report.total = crate::optim::into_vec(sum.clone().inner())[0];
-        Some((sum, report))
+        let loss = sum?;
+        Some(PendingLoss { total: loss.clone().inner(), loss, parts })
     }
 }

@@ -1,7 +1,7 @@
 //! Image quality: PSNR and SSIM of a float image against an 8-bit photograph.
 
+use crate::kernels::cpu::l1_ssim::{Comparison, similarity};
 use crate::losses::LossTarget;
-use crate::losses::ssim_kernel::{Comparison, similarity};
 use gazesplat_core::image::ImageF32;
 use rayon::prelude::*;
 

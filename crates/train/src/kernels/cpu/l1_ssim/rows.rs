@@ -1,27 +1,10 @@
-//! The row passes of [`super::ssim_kernel`]: windows along both axes, the SSIM maps, the gradient.
+//! The row passes of the loss kernel: windows along both axes, the SSIM maps, the gradient.
 //!
 //! A row holds three channels at a stride of `segment` and is padded to whole vectors; rows of a ring are addressed by
 //! their offsets. Every pass works through `n` values, a multiple of 16, of rows of `stride` ≥ n + 16.
 
-use super::ssim_kernel::{Comparison, RADIUS, TAPS, TargetPixel, Weights};
+use super::{C1, C2, Comparison, RADIUS, TAPS, TargetPixel, WINDOW, Weights};
 use gazesplat_render::simd::{LANES, Simd};
-
-/// exp(−d²/(2·1.5²)), d = −5..5, normalised to sum 1.
-pub(super) const WINDOW: [f32; TAPS] = [
-    0.001_028_380_1,
-    0.007_598_758,
-    0.036_000_773,
-    0.109_360_695,
-    0.213_005_54,
-    0.266_011_72,
-    0.213_005_54,
-    0.109_360_695,
-    0.036_000_773,
-    0.007_598_758,
-    0.001_028_380_1,
-];
-const C1: f32 = 0.01 * 0.01;
-const C2: f32 = 0.03 * 0.03;
 
 /// Row `r` of both images by channel, zero outside them; masked pixels take the target's colour.
 #[inline(always)]

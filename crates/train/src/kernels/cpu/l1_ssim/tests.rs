@@ -1,7 +1,6 @@
 //! Tests of the loss kernel: closed forms, finite differences, seams, threads.
 
-use super::ssim_kernel::*;
-use super::ssim_rows::WINDOW;
+use super::*;
 
 fn noise(n: usize, seed: u32) -> Vec<f32> {
     (0..n as u32).map(|i| crate::rng::uniform(crate::rng::philox([i, 0, 0, 0], [seed, 7])[0])).collect()

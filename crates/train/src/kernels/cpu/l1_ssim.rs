@@ -20,20 +20,42 @@
 //!
 //! NaN in the image gives a NaN loss, which the trainer reports. An empty image has L1 0 and SSIM 1.
 
-use super::ssim_rows::{blur_maps, blur_moments, gradient_row, load_row, ssim_maps};
+mod rows;
+#[cfg(test)]
+mod tests;
+
 use gazesplat_render::simd::{Kernel, LANES, Simd, dispatch};
 use rayon::prelude::*;
+use rows::{blur_maps, blur_moments, gradient_row, load_row, ssim_maps};
 use std::cell::RefCell;
 use std::mem::MaybeUninit;
 
 /// Half width of the window.
-pub(super) const RADIUS: usize = 5;
+pub(crate) const RADIUS: usize = 5;
 /// Width of the window.
-pub(super) const TAPS: usize = 2 * RADIUS + 1;
+pub(crate) const TAPS: usize = 2 * RADIUS + 1;
+/// exp(−d²/(2·1.5²)), d = −5..5, normalised to sum 1.
+pub(crate) const WINDOW: [f32; TAPS] = [
+    0.001_028_380_1,
+    0.007_598_758,
+    0.036_000_773,
+    0.109_360_695,
+    0.213_005_54,
+    0.266_011_72,
+    0.213_005_54,
+    0.109_360_695,
+    0.036_000_773,
+    0.007_598_758,
+    0.001_028_380_1,
+];
+/// Keeps the ratio of means finite, (0.01 · range)².
+pub(crate) const C1: f32 = 0.01 * 0.01;
+/// Keeps the ratio of variances finite, (0.03 · range)².
+pub(crate) const C2: f32 = 0.03 * 0.03;
 /// Output rows of a job, about: the overlap costs a tenth more forward work, larger jobs would be too few for many cores.
-pub(super) const BAND_ROWS: usize = 96;
+const BAND_ROWS: usize = 96;
 /// Output columns of a strip: the ring buffers take 0.5 MB, half of a usual L2 cache.
-pub(super) const STRIP_COLUMNS: usize = 512;
+const STRIP_COLUMNS: usize = 512;
 /// Rows of a ring buffer: 11 of the window, 5 older ones whose pixels the gradient still needs; a power of two.
 const RING: usize = 16;
 
@@ -83,6 +105,22 @@ pub struct Similarity {
     pub ssim: f64,
 }
 
+/// Lane of [`Similarity::packed`] that carries the loss.
+pub const LANE_LOSS: usize = 0;
+/// Lane with the mean absolute difference.
+pub const LANE_L1: usize = 1;
+/// Lane with the mean SSIM.
+pub const LANE_SSIM: usize = 2;
+
+impl Similarity {
+    /// The loss (1 − λ) L1 + λ (1 − SSIM) (3DGS, Eq. 7), L1 and SSIM; see the lanes. `ssim_weight` is λ, in 0..1.
+    pub fn packed(&self, ssim_weight: f32) -> [f32; 3] {
+        let w = f64::from(ssim_weight);
+        let loss = (1.0 - w) * self.l1 + w * (1.0 - self.ssim);
+        [loss as f32, self.l1 as f32, self.ssim as f32]
+    }
+}
+
 /// Factors of the two terms of a loss `l1 · L1 + ssim · SSIM` whose gradient is wanted.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Weights {
@@ -90,6 +128,13 @@ pub struct Weights {
     pub l1: f32,
     /// Factor of the mean structural similarity (negative in a loss).
     pub ssim: f32,
+}
+
+impl Weights {
+    /// Those of (1 − λ) L1 + λ (1 − SSIM); `ssim_weight` is λ, in 0..1.
+    pub fn of_loss(ssim_weight: f32) -> Self {
+        Self { l1: 1.0 - ssim_weight, ssim: -ssim_weight }
+    }
 }
 
 /// L1 and SSIM of a comparison.
@@ -185,7 +230,7 @@ fn run<P: TargetPixel>(
 }
 
 /// Rows of a band: the image in a multiple of four nearly equal parts, so that two or four cores end together.
-pub(super) fn band_rows(height: usize) -> usize {
+fn band_rows(height: usize) -> usize {
     height.div_ceil((height / BAND_ROWS).next_multiple_of(4).max(1))
 }
 

@@ -1,0 +1,3 @@
+//! The passes: one file per pass and device, slices in and slices out.
+
+pub mod cpu;

@@ -67,10 +67,13 @@ impl<T: Real> Plane<T> {
     #[inline(always)]
     fn rows_around(&self, y: usize) -> [&[T]; 5] {
         let stride = self.width + 2 * RADIUS;
-        std::array::from_fn(|i| {
-            let row = reflect(y as isize + i as isize - RADIUS as isize, self.height);
-            &self.data[row * stride..][..stride]
-        })
+        // Loops instead of closures: what is not inlined is not compiled for the vector width of the machine.
+        let mut rows = [&self.data[..0]; 5];
+        for (i, row) in rows.iter_mut().enumerate() {
+            let from = reflect(y as isize + i as isize - RADIUS as isize, self.height);
+            *row = &self.data[from * stride..][..stride];
+        }
+        rows
     }
 
     /// Calls `fill(y, row)` for every row on all threads, and reflects the columns.
@@ -186,6 +189,16 @@ fn correlate_any<T: Real, const FMA: bool, const N: usize, const B: usize>(
     sums
 }
 
+/// What tap i of a filter meets.
+#[inline(always)]
+fn neighbours<'a, T, const B: usize>(rows: &[&'a [T]; 5], x0: usize) -> [&'a [T; B]; 25] {
+    let mut at = [block::<T, B>(rows[0], x0); 25];
+    for (i, at) in at.iter_mut().enumerate() {
+        *at = block(rows[i / 5], x0 + i % 5);
+    }
+    at
+}
+
 /// `sums` plus the 25 taps times the block's neighbourhood: tap (i, j) meets column x0 + x + j of row i.
 #[inline(always)]
 fn weighted<T: Real, const FMA: bool, const B: usize>(
@@ -194,7 +207,7 @@ fn weighted<T: Real, const FMA: bool, const B: usize>(
     k: &Kernel<T>,
     mut sums: [T; B],
 ) -> [T; B] {
-    let at: [&[T; B]; 25] = std::array::from_fn(|i| block(rows[i / 5], x0 + i % 5));
+    let at = neighbours::<T, B>(rows, x0);
     for x in 0..B {
         let mut sum = sums[x];
         macro_rules! taps {
@@ -214,7 +227,7 @@ fn correlate_antisymmetric<T: Real, const FMA: bool, const N: usize, const B: us
     kernels: &[Kernel<T>; N],
 ) -> [[T; B]; N] {
     let mut sums = [[T::ZERO; B]; N];
-    let at: [&[T; B]; 25] = std::array::from_fn(|i| block(rows[i / 5], x0 + i % 5));
+    let at = neighbours::<T, B>(rows, x0);
     for x in 0..B {
         let mut sum = [T::ZERO; N];
         macro_rules! pairs {
@@ -233,10 +246,18 @@ fn correlate_antisymmetric<T: Real, const FMA: bool, const N: usize, const B: us
     sums
 }
 
+/// The filter that the adjoint correlates with.
+#[inline(always)]
+pub(crate) fn flipped<T: Real>(kernel: &Kernel<T>) -> Kernel<T> {
+    let mut flipped = *kernel;
+    flipped.reverse();
+    flipped
+}
+
 /// Columns of zeros on each side of a gradient row, for [`correlate_row_bwd`].
 pub(crate) const GRADIENT_PAD: usize = 2 * RADIUS;
 
-/// Adds to `v_row` the gradient by row `y` of a plane of `height` rows, given the gradients by the outputs of `N` filters:
+/// Adds to `v_row` the gradient by row `y` of a plane of `height` rows, given the gradients by the outputs of `N` filters, [`flipped`]:
 /// `v_out(o, r)` is row r, 0 ≤ r < height, |r − y| ≤ 2, of filter o with [`GRADIENT_PAD`] zeros on each side. `zeros` is
 /// such a row of zeros; `reached` is scratch of the plane's width + 4.
 #[inline(always)]
@@ -244,13 +265,11 @@ pub(crate) fn correlate_row_bwd<'a, T: Real, const FMA: bool, const N: usize>(
     v_out: impl Fn(usize, usize) -> &'a [T],
     zeros: &'a [T],
     (y, height): (usize, usize),
-    kernels: &[Kernel<T>],
+    flipped: &[Kernel<T>; N],
     reached: &mut [T],
     v_row: &mut [T],
 ) {
-    let kernels: &[Kernel<T>; N] = kernels.try_into().expect("as many filters as asked for");
     // Correlation with the flipped filter, over the row and the two reflected columns on each side.
-    let flipped: [Kernel<T>; N] = std::array::from_fn(|o| std::array::from_fn(|i| kernels[o][24 - i]));
     let width = v_row.len();
     let (y, n) = (y as isize, height as isize);
     // The row itself and the rows beyond the border that mirror it.
@@ -258,16 +277,19 @@ pub(crate) fn correlate_row_bwd<'a, T: Real, const FMA: bool, const N: usize>(
         if from != y && reflect(from, height) as isize != y {
             continue;
         }
-        let rows_of = |o: usize| -> [&[T]; 5] {
-            std::array::from_fn(|i| {
+        let mut rows = [[zeros; 5]; N];
+        for (o, rows) in rows.iter_mut().enumerate() {
+            for (i, row) in rows.iter_mut().enumerate() {
                 let r = from + i as isize - RADIUS as isize;
-                if (0..n).contains(&r) { v_out(o, r as usize) } else { zeros }
-            })
-        };
+                if (0..n).contains(&r) {
+                    *row = v_out(o, r as usize);
+                }
+            }
+        }
         in_blocks!(width + 2 * RADIUS, |x0, B| {
             let mut sums = [T::ZERO; B];
             for o in 0..N {
-                sums = weighted::<T, FMA, B>(&rows_of(o), x0, &flipped[o], sums);
+                sums = weighted::<T, FMA, B>(&rows[o], x0, &flipped[o], sums);
             }
             reached[x0..x0 + B].copy_from_slice(&sums);
         });
@@ -478,7 +500,7 @@ mod tests {
                         |_, r| &padded[r],
                         &zeros,
                         (y, height),
-                        kernel,
+                        &[flipped(&kernel[0])],
                         &mut reached,
                         &mut v_x[rows],
                     );

@@ -169,7 +169,12 @@ fn compare_row<T: Real, const FMA: bool, const L1: bool>(
 ) {
     let (v_means, v_squares) = v_pixels.split_at_mut(width);
     in_blocks!(width, |x0, B| {
-        let at: [[&[T; B]; 4]; 2] = rows.map(|r| std::array::from_fn(|q| block(&r[q * width..][..width], x0)));
+        let mut at = [[block::<T, B>(rows[0], x0); 4]; 2];
+        for (at, row) in at.iter_mut().zip(rows) {
+            for (q, at) in at.iter_mut().enumerate() {
+                *at = block::<T, B>(&row[q * width..][..width], x0);
+            }
+        }
         let (mut d, mut v_mean, mut v_square) = ([T::ZERO; B], [T::ZERO; B], [T::ZERO; B]);
         for x in 0..B {
             macro_rules! mixed {

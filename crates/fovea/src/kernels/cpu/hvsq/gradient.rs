@@ -4,7 +4,7 @@
 
 use super::{BAND_ROWS, Context, Distance, Tally, by_group, distance_of};
 use crate::kernels::cpu::pooling::Pools;
-use crate::kernels::cpu::pyramid::{GRADIENT_PAD, Kernel, Plane, correlate_row, correlate_row_bwd};
+use crate::kernels::cpu::pyramid::{GRADIENT_PAD, Kernel, Plane, correlate_row, correlate_row_bwd, flipped};
 use crate::real::{Real, Task, dispatch, fma};
 use rayon::prelude::*;
 
@@ -75,6 +75,10 @@ fn band<T: Real, const FMA: bool, const N: usize>(band: Band<'_, T>) -> Tally<T>
     let mut ring = vec![T::ZERO; RING * N * padded];
     let zeros = vec![T::ZERO; padded];
     let mut reached = vec![T::ZERO; width + GRADIENT_PAD];
+    let mut flipped_kernels = [[T::ZERO; 25]; N];
+    for (to, from) in flipped_kernels.iter_mut().zip(kernels) {
+        *to = flipped(from);
+    }
     let (first, end) = if context.gradient { (y0.saturating_sub(2), y1 + 2) } else { (y0, y1) };
     for r in first..end {
         if r < height {
@@ -109,7 +113,7 @@ fn band<T: Real, const FMA: bool, const N: usize>(band: Band<'_, T>) -> Tally<T>
         let ring = &ring;
         let v_out = |o: usize, row: usize| &ring[(row % RING * N + o) * padded..][..padded];
         let v_row = &mut v_rows[(y - y0) * width..][..width];
-        correlate_row_bwd::<T, FMA, N>(v_out, &zeros, (y, height), kernels, &mut reached, v_row);
+        correlate_row_bwd::<T, FMA, N>(v_out, &zeros, (y, height), &flipped_kernels, &mut reached, v_row);
     }
     tally
 }

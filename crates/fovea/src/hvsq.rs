@@ -7,7 +7,15 @@
 //! Images are `[height, width, 3 or more]`, sRGB-encoded, nominally 0..1, not clamped. Sides that are no multiples of 32
 //! are enlarged to the next one. Colours that are not finite give a value that is not finite.
 
+pub mod loss;
+pub mod op;
+pub mod plain;
+
+#[cfg(test)]
+mod tests;
+
 pub use crate::kernels::cpu::hvsq::{Distance, ImageView};
+pub use loss::{HvsqLoss, HvsqMetric, ReferenceCache};
 
 use crate::error::{Error, Result};
 use crate::hvs::pooling::Pooling;
@@ -165,20 +173,26 @@ impl HvsqReference {
         Ok((found.values[0], found.map))
     }
 
+    /// Checks the width and height of an image.
+    fn check_image_size(&self, found: (usize, usize)) -> Result<()> {
+        let size = self.size();
+        if found == size {
+            return Ok(());
+        }
+        Err(Error::Shape {
+            name: "image (width, height)",
+            found: vec![found.0, found.1],
+            expected: vec![size.0, size.1],
+        })
+    }
+
     fn compare(
         &self,
         image: ImageView<'_, f32>,
         wanted: Wanted<'_, f32>,
     ) -> Result<crate::kernels::cpu::hvsq::Found<f32>> {
         check_image(&image)?;
-        let size = self.size();
-        if (image.width, image.height) != size {
-            return Err(Error::Shape {
-                name: "image (width, height)",
-                found: vec![image.width, image.height],
-                expected: vec![size.0, size.1],
-            });
-        }
+        self.check_image_size((image.width, image.height))?;
         Ok(self.inner.plan.compare(&self.inner.statistics, &image, wanted))
     }
 }

@@ -1,9 +1,10 @@
 //! HVSQ in float32 against the golden records, within the tolerances of the specification (hvsq.md §12).
 
-use gazesplat_core::{Display, Gaze, PixelGrid};
+use gazesplat_core::{Display, Gaze, Pinhole, PixelGrid};
 use gazesplat_fovea::Hvsq;
 use gazesplat_fovea::hvs::pooling::{GazePooling, Growth, Pooling};
 use gazesplat_fovea::hvs::pyramid::{FilterBank, Taps};
+use gazesplat_fovea::hvsq::plain::PlainPooling;
 use gazesplat_fovea::hvsq::{Distance, ImageView};
 use gazesplat_testkit::reference::hvsq::images::{interleaved, pair};
 use gazesplat_testkit::{difference, golden};
@@ -228,4 +229,41 @@ fn golden_rtgs_values_and_gradients() {
         num_found += 1;
     }
     assert_eq!(num_found, 8);
+}
+
+/// Tolerance of §12, test 17.
+const PLAIN: f64 = 1e-5;
+
+#[test]
+fn golden_plain_values_regions_and_gradients() {
+    let Some(file) = golden::find("hvsq") else { return };
+    let record = file.load();
+    let json = &record.json["plain"];
+    let camera = |key: &str| number(&json[key]) as f32;
+    let camera =
+        Pinhole { width: 96, height: 64, fx: camera("fx"), fy: camera("fy"), cx: camera("cx"), cy: camera("cy") };
+    let labels: Vec<u8> = record.int("plain.region").iter().map(|v| *v as u8).collect();
+    for (name, growth) in [("quadratic", Growth::Quadratic), ("linear", Growth::Linear)] {
+        let config = &record.json[format!("plain.{name}")];
+        let gaze_px = [0, 1].map(|i| number(&json["gaze_px"][i]));
+        let pooling = PlainPooling { camera, gaze_px, scale: number(&config["scale"]), growth };
+        let (reference, altered) = (record.f32("ref"), record.f32("alt"));
+        let found = pooling.compare(view(&reference, 96, 64, 3), view(&altered, 96, 64, 3)).expect("valid");
+        let radii: Vec<i64> = (0..96 * 64).map(|i| pooling.radius_px(i % 96, i / 96) as i64).collect();
+        assert_eq!(radii, record.int(&format!("plain.{name}.pool_radius_px")), "{name}");
+        assert_relative(found.value, &config["hvsq"], PLAIN, name);
+        for (k, value) in found.by_region(&labels, 4).into_iter().enumerate() {
+            let expected = &config["per_region"][format!("L{}", k + 1)];
+            assert_relative(value.expect("not empty"), expected, PLAIN, &format!("{name} region {k}"));
+        }
+        let d = difference(&found.per_pixel, &record.f64(&format!("plain.{name}.per_pixel")));
+        assert!(d.relative_l2 <= PLAIN, "{name} per pixel: {d:?}");
+        let d = difference(&found.v_altered, &record.f64(&format!("plain.{name}.grad_alt")));
+        assert!(d.relative_l2 <= PLAIN, "{name} gradient: {d:?}");
+    }
+    let pooling = PlainPooling { camera, gaze_px: [30.0, 40.0], scale: 1.0, growth: Growth::Linear };
+    let e: Vec<f64> = (0..96 * 64).map(|i| pooling.eccentricity_rad(i % 96, i / 96)).collect();
+    let d = difference(&e, &record.f64("plain.eccentricity_rad"));
+    // The record's arc cosine loses digits near the gaze.
+    assert!(d.max_abs < 1e-7, "{d:?}");
 }

@@ -99,6 +99,11 @@ impl Trainer {
         })
     }
 
+    /// Adds `weight` times `loss` to what every step minimises.
+    pub fn add_loss(&mut self, weight: f32, loss: Box<dyn crate::losses::ImageLoss>) {
+        self.losses = std::mem::take(&mut self.losses).with(weight, loss);
+    }
+
     /// The model as it is now.
     pub fn splats(&self) -> &Splats {
         self.splats.as_ref().expect("only a step in progress takes the model")

@@ -18,13 +18,25 @@ use std::sync::Arc;
 pub struct LossTarget {
     photo: Arc<TrainingImage>,
     composited: Option<Arc<RgbImage8>>,
+    background: [f32; 3],
 }
 
 impl LossTarget {
     /// The photograph, over `background` (RGB in 0..1) where it is transparent.
     pub fn new(photo: Arc<TrainingImage>, background: [f32; 3]) -> Self {
         let composited = photo.alpha.is_some().then(|| Arc::new(photo.composited(background)));
-        Self { photo, composited }
+        Self { photo, composited, background }
+    }
+
+    /// The photograph: the same allocation for the same view as long as the image cache holds it, which is how losses
+    /// recognise a view whose statistics they keep.
+    pub fn photo(&self) -> &Arc<TrainingImage> {
+        &self.photo
+    }
+
+    /// What shows behind transparent pixels of the photograph, `None` for an opaque one.
+    pub fn background(&self) -> Option<[f32; 3]> {
+        self.photo.alpha.is_some().then_some(self.background)
     }
 
     /// Width and height in pixels.

@@ -1,9 +1,63 @@
-//! Image quality: PSNR and SSIM of a float image against an 8-bit photograph.
+//! Image quality: PSNR and SSIM of a float image against an 8-bit photograph, and what other measures look like.
+
+mod guard;
+
+pub use guard::{Bound, Guard};
 
 use crate::kernels::cpu::l1_ssim::{Comparison, similarity};
 use crate::losses::LossTarget;
 use gazesplat_core::image::ImageF32;
 use rayon::prelude::*;
+
+/// A measure of how close an image comes to its photograph.
+pub trait ImageMetric: Send + Sync {
+    /// Name, as in reports.
+    fn name(&self) -> &str;
+    /// The value for `image` (colours as drawn, not clamped). Not a number where the image is none.
+    ///
+    /// # Errors
+    /// When the two cannot be compared.
+    fn measure(&self, image: &ImageF32, target: &LossTarget) -> crate::Result<f64>;
+}
+
+/// [`psnr`] as a metric.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Psnr;
+
+impl ImageMetric for Psnr {
+    fn name(&self) -> &str {
+        "psnr"
+    }
+
+    fn measure(&self, image: &ImageF32, target: &LossTarget) -> crate::Result<f64> {
+        check_size(image, target)?;
+        Ok(psnr(image, target))
+    }
+}
+
+/// [`ssim`] as a metric.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Ssim;
+
+impl ImageMetric for Ssim {
+    fn name(&self) -> &str {
+        "ssim"
+    }
+
+    fn measure(&self, image: &ImageF32, target: &LossTarget) -> crate::Result<f64> {
+        check_size(image, target)?;
+        Ok(ssim(image, target))
+    }
+}
+
+fn check_size(image: &ImageF32, target: &LossTarget) -> crate::Result<()> {
+    let found = (image.width as usize, image.height as usize);
+    if found == target.size() {
+        return Ok(());
+    }
+    let text = format!("found {} x {}, expected {} x {}", found.0, found.1, target.size().0, target.size().1);
+    Err(crate::Error::parameter("size of the image", text))
+}
 
 /// Value reported for identical images, and the largest one: a mean over views has to stay finite.
 pub const MAX_PSNR_DB: f64 = 100.0;

@@ -33,7 +33,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let pinhole = Pinhole::from_fov_x(640, 480, 60_f32.to_radians());
     let path = CameraPath::orbit(pinhole, center, -Vec3::Y, radius, 0.3 * radius, 12);
 
-    let splats = Splats::from_cloud(&cloud, &cpu_device());
+    let splats = Splats::from_cloud(&cloud, &cpu_device())?;
     std::fs::create_dir_all(&out)?;
     for (name, camera) in &path.frames {
         let frame = render(&splats, camera, &RenderOptions::default())?;

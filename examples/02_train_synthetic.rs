@@ -21,7 +21,9 @@ impl Observer for Teller {
     fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn Error + Send + Sync>> {
         match event {
             TrainEvent::Step(report) if report.step.is_multiple_of(100) => {
-                eprintln!("step {}: loss {:.4}, {} Gaussians", report.step, report.loss, report.num_gaussians);
+                // On a GPU the losses are read back for logged steps only.
+                let loss = report.losses.as_ref().map_or(f32::NAN, |losses| losses.total);
+                eprintln!("step {}: loss {loss:.4}, {} Gaussians", report.step, report.num_gaussians);
             }
             TrainEvent::Evaluated { step, report } => eprintln!("step {step}: {:.2} dB on test views", report.psnr),
             _ => {}
@@ -45,7 +47,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     run(&mut trainer, &mut [&mut Teller], &AtomicBool::new(false))?;
 
     let model = dir.join("model.ply");
-    ply::save(&model, &trainer.to_cloud())?;
+    ply::save(&model, &trainer.to_cloud()?)?;
     eprintln!("wrote {}", model.display());
     Ok(())
 }

@@ -5,10 +5,11 @@ use crate::console::Console;
 use crate::diagnostics::Result;
 use crate::settings;
 use clap::{Args, CommandFactory, FromArgMatches, Parser, Subcommand};
+use gazesplat_render::DeviceChoice;
 use std::path::PathBuf;
 use tracing_subscriber::EnvFilter;
 
-/// Turn photographs with known cameras into 3D Gaussian models, on the CPU.
+/// Turn photographs with known cameras into 3D Gaussian models, on the CPU or a GPU.
 #[derive(Debug, Parser)]
 #[command(
     name = "gazesplat",
@@ -26,6 +27,7 @@ Examples:
   gazesplat train my_capture --config quick            a first model of your own capture
   gazesplat eval runs/my_capture-1 --scene my_capture  PSNR and SSIM on the views kept for testing
   gazesplat render runs/my_capture-1 --scene my_capture --out frames
+  gazesplat info --devices                             what --device gpu would use
 
 Standard output is data, standard error is for people.
 Exit status: 0 done, 1 a check you asked for failed, 2 error."
@@ -63,7 +65,7 @@ pub enum Command {
     Synth(synth::SynthArgs),
     /// See the whole way once: make a scene, train, measure, render, report
     Demo(demo::DemoArgs),
-    /// Say what is in a model, a scene, a camera path or a run
+    /// Say what is in a model, a scene, a camera path or a run; or which devices there are
     Info(info::InfoArgs),
 }
 
@@ -117,6 +119,15 @@ pub struct SettingsArgs {
     /// One setting over those of --config; may be repeated. Example: --set train.steps=3000
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub overrides: Vec<String>,
+}
+
+/// Where a command computes.
+#[derive(Debug, Clone, Copy, Default, Args)]
+pub struct DeviceArgs {
+    /// Where to compute: cpu, gpu (the best adapter, a software driver where there is no other) or gpu:N, numbered as
+    /// in `gazesplat info --devices`
+    #[arg(long, value_name = "DEVICE", default_value_t)]
+    pub device: DeviceChoice,
 }
 
 /// An image size given as `WIDTHxHEIGHT`.

@@ -76,6 +76,17 @@ impl Failure {
         }
     }
 
+    /// Adds what the person should know first, before what they can do about it.
+    #[must_use]
+    pub fn hint_first(mut self, hint: impl Into<String>) -> Self {
+        let hint = hint.into();
+        self.0.hint = Some(match self.0.hint {
+            Some(then) => format!("{hint}; {then}"),
+            None => hint,
+        });
+        self
+    }
+
     /// Points at bytes `span` of the text file `path`, whose content is `text`.
     #[must_use]
     pub fn excerpt(mut self, path: &Path, text: &str, span: Range<usize>, label: impl Into<String>) -> Self {

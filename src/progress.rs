@@ -26,7 +26,8 @@ pub struct TrainProgress<'a> {
     window_start: (Instant, u32),
     steps_per_sec: Option<f64>,
     last_line: Instant,
-    loss: Option<f32>,
+    /// Running mean of the loss and the step it was last fed at.
+    loss: Option<(f32, u32)>,
 }
 
 impl<'a> TrainProgress<'a> {
@@ -38,9 +39,13 @@ impl<'a> TrainProgress<'a> {
     }
 
     fn step(&mut self, report: &StepReport) {
-        let mean = self.loss.map_or(report.loss, |mean| mean + LOSS_WEIGHT * (report.loss - mean));
-        self.loss = Some(mean);
         let done = report.step;
+        // A GPU reads the loss of some steps only: one stands for those since the last.
+        if let Some(loss) = report.losses.as_ref().map(|losses| losses.total) {
+            let (mean, fed) = self.loss.unwrap_or((loss, done));
+            let weight = 1.0 - (1.0 - LOSS_WEIGHT).powf((done - fed.min(done)) as f32);
+            self.loss = Some((mean + weight * (loss - mean), done));
+        }
         self.measure_rate(done);
         if self.console.is_live() {
             self.bar.set_position(u64::from(done));
@@ -68,7 +73,7 @@ impl<'a> TrainProgress<'a> {
         let left = f64::from(self.num_steps.saturating_sub(done)) / rate.max(1e-9);
         format!(
             "loss {:.4}  {} Gaussians  {rate:.0} it/s  {} left",
-            self.loss.unwrap_or(report.loss),
+            self.loss.map_or(f32::NAN, |(mean, _)| mean),
             grouped(report.num_gaussians),
             duration(left)
         )

@@ -125,13 +125,14 @@ impl RunDir {
         Ok(())
     }
 
-    /// Writes `settings.toml`: the resolved settings under a line that says where they come from.
+    /// Writes `settings.toml`: the resolved settings under lines that say where they come from, and on which device the
+    /// run computes, which is no setting: it is of the machine.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn write_settings(&self, config: &Config, scene: &Path) -> Result<()> {
+    pub fn write_settings(&self, config: &Config, scene: &Path, device: &str) -> Result<()> {
         let text = format!(
-            "# Resolved settings of a run of gazesplat {} on `{}`.\n\n{}",
+            "# Resolved settings of a run of gazesplat {} on `{}`.\n# Computed on: {device}.\n\n{}",
             env!("CARGO_PKG_VERSION"),
             scene.display(),
             settings::to_toml(config)

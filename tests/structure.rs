@@ -1,7 +1,7 @@
 //! The shape of the workspace: which crate may know which, twins of kernels, long files, silent libraries.
 
 use cargo_metadata::{DependencyKind, MetadataCommand};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -75,19 +75,60 @@ fn core_knows_no_tensors_and_libraries_no_command_line() {
     }
 }
 
-#[test]
-fn cpu_and_gpu_kernels_have_the_same_files() {
-    // Only the files of the directory itself: a folder of a kernel's name holds parts of it, which need no twin.
-    let names = |dir: &Path| -> BTreeSet<PathBuf> {
-        let below = rust_files(dir).into_iter().map(|p| p.strip_prefix(dir).expect("below dir").to_owned());
-        below.filter(|p| p.components().count() == 1).collect()
-    };
-    for crate_name in ["render", "train", "fovea"] {
-        let kernels = root().join("crates").join(crate_name).join("src/kernels");
-        let (cpu, gpu) = (kernels.join("cpu"), kernels.join("gpu"));
-        if gpu.is_dir() {
-            assert_eq!(names(&cpu), names(&gpu), "{crate_name}");
+/// The files of kernels in `dir`, by pass.
+fn passes(dir: &Path) -> BTreeMap<String, String> {
+    let mut passes = BTreeMap::new();
+    for path in rust_files(dir) {
+        let pass = path.file_stem().expect("a file has a name").to_string_lossy().into_owned();
+        if path.parent() == Some(dir) && pass != "mod" {
+            passes.insert(pass, fs::read_to_string(&path).expect("source is UTF-8"));
         }
+    }
+    passes
+}
+
+/// Public functions that stand at the left margin of a file: not those of an `impl`.
+fn public_functions(text: &str) -> BTreeSet<&str> {
+    let name = |line| str::strip_prefix(line, "pub fn ")?.split(['(', '<']).next();
+    text.lines().filter_map(name).collect()
+}
+
+#[test]
+fn every_kernel_has_a_twin_on_the_other_processor() {
+    let mut num_pairs = 0;
+    for entry in fs::read_dir(root().join("crates")).expect("readable") {
+        let kernels = entry.expect("readable").path().join("src/kernels");
+        let [cpu, gpu] = ["cpu", "gpu"].map(|processor| passes(&kernels.join(processor)));
+        if !kernels.join("cpu").is_dir() || !kernels.join("gpu").is_dir() {
+            continue;
+        }
+        let names = |passes: &BTreeMap<String, String>| passes.keys().cloned().collect::<Vec<_>>();
+        assert_eq!(names(&cpu), names(&gpu), "{}: files of one side only", kernels.display());
+        for (pass, text) in &cpu {
+            let (on_cpu, on_gpu) = (public_functions(text), public_functions(&gpu[pass]));
+            let entry = pass.as_str();
+            assert!(
+                !on_cpu.contains(entry) || on_gpu.contains(entry),
+                "{}: kernels/gpu/{pass}.rs has no `pub fn {entry}`, kernels/cpu/{pass}.rs has",
+                kernels.display()
+            );
+            assert!(
+                on_cpu.is_empty() || !on_cpu.is_disjoint(&on_gpu),
+                "{}: {pass}.rs has none of its entries {on_cpu:?} on the GPU, where it has {on_gpu:?}",
+                kernels.display()
+            );
+            num_pairs += 1;
+        }
+    }
+    assert!(num_pairs > 0, "no kernels found: the tree has changed its shape");
+}
+
+/// What the gradients rest on: a sum of floats has one order, and no driver is asked for what it may lack.
+#[test]
+fn no_kernel_adds_floats_atomically() {
+    for path in own_files().into_iter().filter(|p| p.to_string_lossy().contains("kernels/gpu")) {
+        let text = fs::read_to_string(&path).expect("source is UTF-8");
+        assert!(!text.contains("Atomic<f"), "{} uses atomics on floats", path.display());
     }
 }
 

@@ -1,8 +1,10 @@
 //! `gazesplat demo`: the whole way once, on a scene that needs no download.
 
+use super::device::ComputeDevice;
 use super::frames::{self, NamedCamera};
 use super::synth;
 use super::train::{TrainJob, Trained, train};
+use crate::cli::DeviceArgs;
 use crate::console::{Console, duration, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::interrupt;
@@ -14,7 +16,7 @@ use clap::Args;
 use gazesplat_core::RgbImage8;
 use gazesplat_core::camera::path::CameraPath;
 use gazesplat_core::synthetic::SynthOptions;
-use gazesplat_render::{Splats, cpu_device};
+use gazesplat_render::Splats;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -41,6 +43,9 @@ pub struct DemoArgs {
     /// Directory for everything the demo makes; the default is replaced each time
     #[arg(long, value_name = "DIR", default_value = DEFAULT_OUT)]
     pub out: PathBuf,
+    /// Device
+    #[command(flatten)]
+    pub device: DeviceArgs,
     /// A small scene and few steps: shows that everything works, not how good it gets
     #[arg(long)]
     pub quick: bool,
@@ -52,8 +57,13 @@ pub struct DemoArgs {
 /// Runs `demo`.
 ///
 /// # Errors
-/// When the directory cannot be written.
+/// When the device cannot be used, or the directory cannot be written.
 pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
+    let device = ComputeDevice::open(args.device.device, console)?;
+    device.guard(|| demo(args, &device, console))
+}
+
+fn demo(args: &DemoArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
     let started = Instant::now();
     let stop = interrupt::stop_flag()?;
     let overwrite = args.overwrite || args.out == Path::new(DEFAULT_OUT);
@@ -71,7 +81,7 @@ pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
         .with_override(&format!("train.steps={}", size.num_steps))?
         .with_override(&format!("densify.cap={}", size.cap))?
         .resolve()?;
-    let job = TrainJob { scene: &scene, config, out: Some(&args.out), overwrite };
+    let job = TrainJob { scene: &scene, config, out: Some(&args.out), overwrite, device };
     let mut trained = train(&job, stop, console)?;
 
     console.note("3/3  an orbit through the model");
@@ -88,8 +98,9 @@ pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
     };
     report.subtitle = format!(
         "{} photographs of a procedural room went in, this 3D Gaussian model came out after {num_steps} steps on the \
-         processor.",
-        size.scene.num_views
+         {}.",
+        size.scene.num_views,
+        if device.is_gpu() { "graphics card" } else { "processor" }
     );
     report.film = film;
     report.durations.insert(0, ("making the scene".to_owned(), synth_secs));
@@ -188,7 +199,7 @@ fn write_orbit(
     let path = CameraPath::through(&keys, num_frames, true)?;
     path.save(out.join("orbit.json"))?;
     let file = out.join("orbit.y4m");
-    let splats = Splats::from_cloud(&trained.cloud, &cpu_device());
+    let splats = Splats::from_cloud(&trained.cloud, job.device.tensors())?;
     let options = job.config.render_options();
     let bar = progress::counting_bar(console, "rendering", path.frames.len());
     let mut film = Vec::new();

@@ -1,13 +1,14 @@
 //! `gazesplat eval`: how close a model comes to the photographs of a scene.
 
+use super::device::ComputeDevice;
 use super::{Model, Split, load_scene, log_machine, quality};
-use crate::cli::SettingsArgs;
+use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::run_dir;
 use clap::Args;
 use gazesplat_core::io::images::ImageCache;
-use gazesplat_render::{Splats, cpu_device};
+use gazesplat_render::Splats;
 use gazesplat_train::with_threads;
 use std::path::PathBuf;
 
@@ -18,6 +19,7 @@ Examples:
   gazesplat eval runs/fox-1 --scene fox
   gazesplat eval model.ply --scene fox --split all --set data.max_side=480 > eval.json
   gazesplat eval runs/fox-1 --scene fox --min-psnr 25 || echo worse than 25 dB
+  gazesplat eval runs/fox-1 --scene fox --device gpu
 
 A run is measured with the settings it was trained with (image size, split, background), a PLY
 file with the defaults.
@@ -36,6 +38,9 @@ pub struct EvalArgs {
     /// Which views of the scene
     #[arg(long, value_enum, default_value = "test")]
     pub split: Split,
+    /// Device
+    #[command(flatten)]
+    pub device: DeviceArgs,
     /// Exit with status 1 when the mean PSNR is below this many dB
     #[arg(long, value_name = "DB")]
     pub min_psnr: Option<f64>,
@@ -47,15 +52,20 @@ pub struct EvalArgs {
 /// Runs `eval`.
 ///
 /// # Errors
-/// When the model or the scene cannot be read, or the quality is below `--min-psnr`.
+/// When the device, the model or the scene cannot be used, or the quality is below `--min-psnr`.
 pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
+    let device = ComputeDevice::open(args.device.device, console)?;
+    device.guard(|| eval(args, &device, console))
+}
+
+fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
     let model = Model::load_for_drawing(&args.model, console)?;
     let config = model.settings(&args.settings)?;
     let dataset = load_scene(&args.scene, &config, console)?;
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
     let report = with_threads(config.train.threads, || {
         log_machine();
-        let splats = Splats::from_cloud(&model.cloud, &cpu_device());
+        let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
         quality::measure(&splats, &images, &config.render_options(), console)
     })??;
     tracing::info!("images in memory: {} of {}", bytes(images.num_bytes() as u64), images.len());

@@ -1,6 +1,6 @@
-//! `gazesplat info`: what is in a model, a scene, a camera path or a run.
+//! `gazesplat info`: what is in a model, a scene, a camera path or a run; or which devices there are.
 
-use super::{Model, load_scene};
+use super::{Model, devices, load_scene};
 use crate::console::{Console, bytes, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::run_dir::RunDir;
@@ -17,13 +17,24 @@ use std::path::{Path, PathBuf};
 
 /// Arguments of `info`.
 #[derive(Debug, Args)]
-#[command(after_help = "\
+#[command(
+    group(clap::ArgGroup::new("subject").required(true).args(["path", "devices"])),
+    after_help = "\
 Examples:
   gazesplat info model.ply
-  gazesplat info my_capture --json | jq .num_points")]
+  gazesplat info my_capture --json | jq .num_points
+  gazesplat info --devices
+
+--devices tells the CPU and every GPU adapter that a Vulkan, Metal or DirectX 12 driver offers,
+numbered as `--device gpu:N` counts them, with the limits that matter and whether they suffice.
+A software driver computes on the CPU: it is for tests."
+)]
 pub struct InfoArgs {
     /// A PLY file, a scene, a camera path (JSON), or the directory of a run
-    pub path: PathBuf,
+    pub path: Option<PathBuf>,
+    /// Tell what `--device` can name on this machine
+    #[arg(long)]
+    pub devices: bool,
     /// JSON instead of a table
     #[arg(long)]
     pub json: bool,
@@ -34,7 +45,7 @@ pub struct InfoArgs {
 /// # Errors
 /// When there is nothing at the path that the program knows, or it is damaged.
 pub fn command(args: &InfoArgs, console: &Console) -> Result<()> {
-    let path = &args.path;
+    let Some(path) = &args.path else { return devices::tell(args.json, console) };
     let mut facts = Facts::default();
     if path.is_dir() && path.join("point_cloud.ply").is_file() && !is_scene(path) {
         run(path, &mut facts, console)?;

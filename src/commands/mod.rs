@@ -1,13 +1,16 @@
 //! The commands of the program, one file each, and what several of them share: scenes, models, threads.
 
 pub mod demo;
+pub mod device;
 pub mod eval;
 pub mod info;
 pub mod render;
 pub mod synth;
 pub mod train;
 
+mod devices;
 mod frames;
+mod keeper;
 mod quality;
 mod record;
 
@@ -20,6 +23,7 @@ use gazesplat_core::dataset::LoadOptions;
 use gazesplat_core::io::ply;
 use gazesplat_core::{Dataset, GaussianCloud, View};
 use gazesplat_render::cluster::morton_order;
+use gazesplat_render::simd::{self, SimdLevel};
 use gazesplat_train::Config;
 use std::path::{Path, PathBuf};
 
@@ -177,11 +181,16 @@ pub(crate) fn layered(settings: Settings, args: &SettingsArgs) -> Result<Setting
 
 /// Tells what the machine works with, at `-v`.
 pub(crate) fn log_machine() {
-    tracing::info!(
-        "{} threads, vector instructions {:?}",
-        rayon::current_num_threads(),
-        gazesplat_render::simd::level()
-    );
+    tracing::info!("{} threads, vector instructions {}", rayon::current_num_threads(), vector_instructions());
+}
+
+/// The vector instructions the CPU kernels use on this machine.
+pub(crate) fn vector_instructions() -> &'static str {
+    match simd::level() {
+        SimdLevel::Avx512 => "AVX-512",
+        SimdLevel::Avx2 => "AVX2 + FMA",
+        SimdLevel::Scalar => "portable",
+    }
 }
 
 #[cfg(test)]

@@ -103,12 +103,13 @@ impl Recorder {
                 stages().collect::<Vec<_>>().join(", ")
             );
         }
-        self.pending = Some(Record {
+        // Steps that are logged or measured have their losses on every device.
+        self.pending = report.losses.as_ref().map(|losses| Record {
             step: report.step,
-            loss: report.loss,
-            l1: report.l1,
-            ssim: report.ssim,
-            terms: report.terms.iter().map(|term| (term.name, term.value)).collect(),
+            loss: losses.total,
+            l1: losses.get("l1").unwrap_or(f32::NAN),
+            ssim: losses.get("ssim").unwrap_or(f32::NAN),
+            terms: losses.terms.iter().map(|term| (term.name, term.value)).collect(),
             num_gaussians: report.num_gaussians,
             step_ms: report.stage_ms,
             test: None,

@@ -1,15 +1,16 @@
 //! `gazesplat render`: a model seen from the cameras of a scene or along a path, as PNG files or a video.
 
+use super::device::ComputeDevice;
 use super::frames::{self, NamedCamera};
 use super::{Model, Split, load_scene, log_machine};
-use crate::cli::{SettingsArgs, Size, parse_fov_deg, parse_rgb, parse_size};
+use crate::cli::{DeviceArgs, SettingsArgs, Size, parse_fov_deg, parse_rgb, parse_size};
 use crate::console::{Console, duration};
 use crate::diagnostics::{Failure, Result};
 use crate::progress;
 use clap::Args;
 use gazesplat_core::Pinhole;
 use gazesplat_core::camera::path::CameraPath;
-use gazesplat_render::{RenderOptions, RenderStats, Splats, StatsMode, cpu_device};
+use gazesplat_render::{RenderOptions, RenderStats, Splats, StatsMode};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -24,7 +25,7 @@ const SCENE_FPS: f32 = 30.0;
     after_help = "\
 Examples:
   gazesplat render runs/fox-1 --scene fox --split test --out frames
-  gazesplat render model.ply --path orbit.json --size 1280x720 --out orbit.y4m
+  gazesplat render model.ply --path orbit.json --size 1280x720 --out orbit.y4m --device gpu
   ffmpeg -i orbit.y4m -crf 16 orbit.mp4
 
 A .y4m video is raw: YUV 4:4:4, 8 bit, BT.709, limited range. Players and encoders read it as it is.
@@ -59,6 +60,9 @@ pub struct RenderArgs {
     /// Colour behind everything, channels 0 to 1 [default: the run's, or 0,0,0]
     #[arg(long, value_name = "R,G,B", value_parser = parse_rgb)]
     pub background: Option<[f32; 3]>,
+    /// Device
+    #[command(flatten)]
+    pub device: DeviceArgs,
     /// Print what each frame cost as JSON on standard output
     #[arg(long)]
     pub stats: bool,
@@ -70,9 +74,14 @@ pub struct RenderArgs {
 /// Runs `render`.
 ///
 /// # Errors
-/// When the model, the cameras or an option is wrong, or the frames cannot be written.
+/// When the device cannot be used, the model, the cameras or an option is wrong, or the frames cannot be written.
 pub fn command(args: &RenderArgs, console: &Console) -> Result<()> {
     let target = Target::new(args)?;
+    let device = ComputeDevice::open(args.device.device, console)?;
+    device.guard(|| render(args, &target, &device, console))
+}
+
+fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &Console) -> Result<()> {
     log_machine();
     let model = Model::load_for_drawing(&args.model, console)?;
     let mut config = model.settings(&SettingsArgs::default())?;
@@ -103,7 +112,7 @@ pub fn command(args: &RenderArgs, console: &Console) -> Result<()> {
         camera.intrinsics = replaced(camera.intrinsics, args.size, args.fov);
     }
 
-    let splats = Splats::from_cloud(&model.cloud, &cpu_device());
+    let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
     let bar = progress::counting_bar(console, "rendering", cameras.len());
     let started = Instant::now();
     let mut stats: Vec<(String, RenderStats)> = Vec::new();
@@ -113,13 +122,13 @@ pub fn command(args: &RenderArgs, console: &Console) -> Result<()> {
         bar.inc(1);
         Ok(image)
     };
-    match &target {
+    match target {
         Target::Pngs(dir) => frames::write_pngs(dir, &cameras, frame)?,
         Target::Video(file) => frames::write_video(file, &cameras, fps, frame)?,
     }
     bar.finish_and_clear();
     let (n, secs) = (cameras.len(), started.elapsed().as_secs_f64());
-    match &target {
+    match target {
         Target::Pngs(dir) => console.note(format_args!("{n} frames in `{}`, {}", dir.display(), duration(secs))),
         Target::Video(file) => console.note(format_args!(
             "{n} frames in `{}` (YUV 4:4:4, BT.709, limited range), {}",

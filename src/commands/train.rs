@@ -1,8 +1,10 @@
 //! `gazesplat train`: photographs in, a model with its measured quality out.
 
+use super::device::ComputeDevice;
+use super::keeper::{self, Kept};
 use super::record::Recorder;
 use super::{layered, load_scene, log_machine, quality, scene_name};
-use crate::cli::SettingsArgs;
+use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, duration, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::interrupt;
@@ -10,10 +12,10 @@ use crate::progress::{self, TrainProgress};
 use crate::report::{Figure, Measured, Report, html};
 use crate::run_dir::RunDir;
 use crate::settings::{self, Settings};
-use clap::{Args, ValueEnum};
+use clap::Args;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Dataset, GaussianCloud};
-use gazesplat_render::{Splats, cpu_device};
+use gazesplat_render::Splats;
 use gazesplat_train::{Config, EvalReport, Outcome, Trainer, with_threads};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -27,8 +29,10 @@ Examples:
   gazesplat train my_capture --config quick
   gazesplat train my_capture --set train.steps=3000 --set data.max_side=480 --out runs/small
   gazesplat train my_capture --config my.toml --set train.seed=1
+  gazesplat train my_capture --device gpu
 
-Ctrl-C stops after the current step and keeps what there is; a second Ctrl-C ends at once.")]
+Ctrl-C stops after the current step and keeps what there is; a second Ctrl-C ends at once. A run
+that fails leaves its last good model in `unfinished.ply`.")]
 pub struct TrainArgs {
     /// The scene: a COLMAP directory or one with `transforms.json`
     pub scene: PathBuf,
@@ -38,36 +42,22 @@ pub struct TrainArgs {
     /// Directory for the run [default: runs/SCENE-N]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Where to compute
-    #[arg(long, value_enum, default_value = "cpu")]
-    pub device: DeviceArg,
+    /// Device
+    #[command(flatten)]
+    pub device: DeviceArgs,
     /// Replace the run that is in the directory given with --out
     #[arg(long)]
     pub overwrite: bool,
 }
 
-/// Where to compute.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum DeviceArg {
-    /// The processor, all its cores unless train.threads says otherwise
-    Cpu,
-    /// A graphics card: not in this version yet
-    Gpu,
-}
-
 /// Runs `train`.
 ///
 /// # Errors
-/// When the scene, the settings or the directory cannot be used, or the training fails.
+/// When the scene, the settings, the device or the directory cannot be used, or the training fails.
 pub fn command(args: &TrainArgs, console: &Console) -> Result<()> {
-    if args.device == DeviceArg::Gpu {
-        return Err(Failure::new(
-            "this version of gazesplat computes on the CPU only, `--device gpu` is not there yet",
-        )
-        .hint("use `--device cpu`"));
-    }
     let config = layered(Settings::new(), &args.settings)?.resolve()?;
-    let job = TrainJob { scene: &args.scene, config, out: args.out.as_deref(), overwrite: args.overwrite };
+    let device = &ComputeDevice::open(args.device.device, console)?;
+    let job = TrainJob { scene: &args.scene, config, out: args.out.as_deref(), overwrite: args.overwrite, device };
     train(&job, interrupt::stop_flag()?, console)?;
     Ok(())
 }
@@ -83,6 +73,8 @@ pub struct TrainJob<'a> {
     pub out: Option<&'a Path>,
     /// Whether a run that is already in `out` is replaced.
     pub overwrite: bool,
+    /// Where to compute.
+    pub device: &'a ComputeDevice,
 }
 
 /// What a training left behind.
@@ -106,9 +98,10 @@ pub struct Trained {
 /// there is by then is saved and measured like a finished model.
 ///
 /// # Errors
-/// When the scene or the directory cannot be used, an image does not decode, or the loss is no longer finite.
+/// When the scene or the directory cannot be used, an image does not decode, the loss is no longer finite, or the GPU
+/// stops. Of a training that fails after its first step the last model that can be had is in `unfinished.ply`.
 pub fn train(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result<Trained> {
-    with_threads(job.config.train.threads, || train_here(job, stop, console))?
+    with_threads(job.config.train.threads, || job.device.guard(|| train_here(job, stop, console)))?
 }
 
 fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result<Trained> {
@@ -140,7 +133,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
     preload(&images, console)?;
-    let mut trainer = Trainer::new(&dataset, Arc::clone(&images), config, &cpu_device())?;
+    let mut trainer = Trainer::new(&dataset, Arc::clone(&images), config, job.device.tensors())?;
     warnings.extend_from_slice(trainer.messages());
     let (measured, measured_images) = match dataset.test.is_empty() {
         false => (Measured::Test, Arc::clone(trainer.test_images())),
@@ -165,20 +158,25 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     if job.overwrite {
         run_dir.clear()?;
     }
-    run_dir.write_settings(config, job.scene)?;
+    run_dir.write_settings(config, job.scene, &job.device.describe())?;
     let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every);
     let mut bar = TrainProgress::new(console, config.train.steps);
     let started = Instant::now();
-    let ended = gazesplat_train::run(&mut trainer, &mut [&mut recorder, &mut bar], stop);
+    let mut kept = None;
+    let ended = keeper::run(&mut trainer, &mut [&mut recorder, &mut bar], stop, job.device, &mut kept);
     drop(bar);
     recorder.flush()?;
     let train_secs = started.elapsed().as_secs_f64();
     durations.push(("training".to_owned(), train_secs));
-    let cloud = trainer.to_cloud();
     let num_steps = trainer.step_index();
-    let outcome = match ended {
-        Ok(outcome) => outcome,
-        Err(error) => return Err(salvage(error.into(), &run_dir, &cloud, num_steps)),
+    // A lost GPU takes the model with it; what a person waited for is then the last copy.
+    let latest = job.device.guard(|| Ok(trainer.to_cloud()?));
+    let (outcome, cloud) = match (ended, latest) {
+        (Ok(outcome), Ok(cloud)) => (outcome, cloud),
+        (Err(failure), Ok(cloud)) if !cloud.is_empty() => {
+            return Err(salvage(failure, &run_dir, Some(Kept { step: num_steps, cloud })));
+        }
+        (Err(failure), _) | (Ok(_), Err(failure)) => return Err(salvage(failure, &run_dir, kept)),
     };
     run_dir.write_model(&cloud)?;
     if outcome == Outcome::Stopped {
@@ -187,7 +185,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let started = Instant::now();
     let options = config.render_options();
-    let splats = Splats::from_cloud(&cloud, &cpu_device());
+    let splats = Splats::from_cloud(&cloud, job.device.tensors())?;
     let eval = match recorder.take_evaluation(num_steps) {
         // The run has just measured this very model.
         Some(eval) if eval.num_gaussians == cloud.len() => eval,
@@ -250,13 +248,13 @@ fn preload(images: &ImageCache, console: &Console) -> Result<()> {
 }
 
 /// A training that failed half-way keeps its last good model, under a name that no one takes for a finished one.
-fn salvage(failure: Failure, run_dir: &RunDir, cloud: &GaussianCloud, num_steps: u32) -> Failure {
-    if num_steps == 0 || cloud.is_empty() {
+fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
+    let Some(Kept { step, cloud }) = last.filter(|kept| kept.step > 0 && !kept.cloud.is_empty()) else {
         return failure;
-    }
+    };
     let path = run_dir.unfinished_path();
-    match gazesplat_core::io::ply::save(&path, cloud) {
-        Ok(()) => failure.hint(format!("the model as it was after step {num_steps} is in `{}`", path.display())),
+    match gazesplat_core::io::ply::save(&path, &cloud) {
+        Ok(()) => failure.hint_first(format!("the model as it was after step {step} is in `{}`", path.display())),
         Err(_) => failure,
     }
 }
@@ -275,6 +273,40 @@ fn facts(job: &TrainJob<'_>, dataset: &Dataset, run_dir: &RunDir) -> Vec<(String
     if let Ok(file) = std::fs::metadata(run_dir.model_path()) {
         facts.push(("model file".to_owned(), format!("point_cloud.ply, {}", bytes(file.len()))));
     }
+    facts.push(("computed on".to_owned(), job.device.describe()));
     facts.push(("spherical harmonics".to_owned(), format!("degree {}", job.config.model.sh_degree)));
     facts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gazesplat_core::io::ply;
+
+    fn one_gaussian() -> GaussianCloud {
+        GaussianCloud {
+            means: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            log_scales: vec![[0.0; 3]],
+            opacity_logits: vec![0.0],
+            sh_degree: 0,
+            sh: vec![[0.0; 3]],
+        }
+    }
+
+    #[test]
+    fn failed_training_leaves_its_last_model_and_says_of_which_step_it_is() {
+        let dir = tempfile::tempdir().expect("temporary directory");
+        let run_dir = RunDir::create(dir.path(), false).expect("writable");
+        let lost = || Failure::from(gazesplat_render::Error::Device { message: "device lost".to_owned() });
+        for nothing in [None, Some(Kept { step: 0, cloud: one_gaussian() })] {
+            salvage(lost(), &run_dir, nothing);
+            assert!(!run_dir.unfinished_path().exists(), "a model without a step is none");
+        }
+        let report = salvage(lost(), &run_dir, Some(Kept { step: 20, cloud: one_gaussian() })).report(false);
+        assert_eq!(ply::load(run_dir.unfinished_path()).expect("readable"), one_gaussian());
+        assert!(report.contains("hint: the model as it was after step 20 is in `"), "{report}");
+        assert!(report.contains("unfinished.ply`; what was saved is intact; free memory of the card"), "{report}");
+        assert!(!run_dir.model_path().exists(), "nobody takes it for a finished run");
+    }
 }

@@ -51,3 +51,14 @@ fn version_is_printed() {
     let version = Place::new().run(&["--version"]).done().stdout;
     assert_eq!(version, format!("gazesplat {}\n", env!("CARGO_PKG_VERSION")));
 }
+
+#[test]
+fn help_teaches_what_a_device_is_called() {
+    for command in ["train", "eval", "render", "demo"] {
+        let help = Place::new().run(&[command, "-h"]).done().stdout;
+        let words = help.split_whitespace().collect::<Vec<_>>().join(" ");
+        for told in ["--device <DEVICE>", "gpu:N", "software driver", "`gazesplat info --devices`", "[default: cpu]"] {
+            assert!(words.contains(told), "{command}: {told}:\n{help}");
+        }
+    }
+}

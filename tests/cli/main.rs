@@ -4,6 +4,7 @@
 
 mod bad_input;
 mod demo;
+mod device;
 mod eval;
 mod help;
 mod info;

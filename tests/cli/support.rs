@@ -67,7 +67,21 @@ impl Place {
 
     /// Runs `gazesplat` with `args` here.
     pub fn run(&self, args: &[&str]) -> Ended {
-        let output = self.command(args).output().expect("the program starts");
+        Self::end(self.command(args))
+    }
+
+    /// Runs `gazesplat` with `args` here, where no Vulkan driver can be found.
+    #[cfg(target_os = "linux")]
+    pub fn run_without_gpu(&self, args: &[&str]) -> Ended {
+        let mut command = self.command(args);
+        // The second name is that of loaders before 1.3.207.
+        command.env("VK_DRIVER_FILES", "/nonexistent").env("VK_ICD_FILENAMES", "/nonexistent");
+        command.env_remove("VK_ADD_DRIVER_FILES");
+        Self::end(command)
+    }
+
+    fn end(mut command: assert_cmd::Command) -> Ended {
+        let output = command.output().expect("the program starts");
         let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
         Ended { code: output.status.code().unwrap_or(-1), stdout: text(&output.stdout), stderr: text(&output.stderr) }
     }

@@ -31,6 +31,13 @@ fn metrics_are_one_object_per_logged_step() {
 }
 
 #[test]
+fn run_says_where_it_was_computed() {
+    let place = Place::with_run();
+    assert!(place.read("run/settings.toml").contains("\n# Computed on: CPU.\n"));
+    assert!(place.read("run/report.html").contains("<th>computed on</th><td>CPU</td>"));
+}
+
+#[test]
 fn evaluation_has_the_promised_fields() {
     let place = Place::with_run();
     let eval: Value = serde_json::from_str(&place.read("run/eval.json")).expect("JSON");
@@ -130,12 +137,6 @@ fn every_view_may_train() {
     let report = place.read("out/report.html");
     assert!(report.contains("Training views") && report.contains("training views</summary>"));
     assert!(!report.contains("Test views") && !report.contains("never saw"));
-}
-
-#[test]
-fn gpu_is_refused_with_the_way_out() {
-    let said = Place::with_scene().run(&["train", "scene", "--device", "gpu"]).refused();
-    assert!(said.contains("hint: use `--device cpu`"), "{said}");
 }
 
 #[cfg(unix)]

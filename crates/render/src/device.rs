@@ -2,9 +2,10 @@
 
 use crate::error::{Error, Result};
 use burn::backend::DispatchDevice;
-use burn::tensor::Device;
 use std::fmt;
 use std::str::FromStr;
+
+pub use burn::tensor::Device;
 
 /// A device as people name it: `cpu`, `gpu` or `gpu:N`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -81,7 +82,7 @@ pub fn is_gpu(device: &Device) -> bool {
 }
 
 /// A GPU adapter of this machine.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Adapter {
     /// Name, as the driver gives it.
     pub name: String,
@@ -105,7 +106,19 @@ pub struct Adapter {
     pub plane_sizes: [u32; 2],
     /// True for the adapter that `gpu` without a number means.
     pub is_default: bool,
+    /// Whether it has what the kernels need; else [`Error::Limit`] with the first thing it has too little of.
+    pub usable: Result<()>,
 }
+
+impl Adapter {
+    /// True for a driver that computes on the CPU: for tests, slower than the CPU kernels.
+    pub fn is_software(&self) -> bool {
+        self.kind == SOFTWARE
+    }
+}
+
+/// The [`Adapter::kind`] of a driver that computes on the CPU.
+const SOFTWARE: &str = "software";
 
 /// The GPU adapters of this machine, in the order of `gpu:N`; empty without a graphics driver.
 #[cfg(feature = "gpu")]
@@ -139,8 +152,8 @@ pub fn gpu_device(_index: Option<usize>) -> Result<Device> {
 
 #[cfg(feature = "gpu")]
 mod wgpu_adapters {
-    use super::{Adapter, Device, Error, Result};
-    use crate::gpu::check_limits;
+    use super::{Adapter, Device, Error, Result, SOFTWARE};
+    use crate::gpu::{check_device, check_limits};
     use burn::tensor::DeviceKind;
     use burn_wgpu::WgpuBackend;
     use burn_wgpu::wgpu::{AdapterInfo, Backend, DeviceType, Instance, InstanceDescriptor, Limits};
@@ -197,7 +210,7 @@ mod wgpu_adapters {
                     DeviceType::DiscreteGpu => "discrete GPU",
                     DeviceType::IntegratedGpu => "integrated GPU",
                     DeviceType::VirtualGpu => "virtual GPU",
-                    DeviceType::Cpu => "software",
+                    DeviceType::Cpu => SOFTWARE,
                     DeviceType::Other => "other",
                 },
                 api: format!("{:?}", info.backend),
@@ -209,6 +222,11 @@ mod wgpu_adapters {
                 max_workgroups: limits.max_compute_workgroups_per_dimension,
                 plane_sizes: [info.subgroup_min_size, info.subgroup_max_size],
                 is_default: index == default,
+                usable: check_limits(
+                    limits.max_compute_invocations_per_workgroup,
+                    limits.max_storage_buffers_per_shader_stage,
+                    limits.max_compute_workgroup_storage_size as usize,
+                ),
             })
             .collect()
     }
@@ -226,10 +244,9 @@ mod wgpu_adapters {
             return Ok(device.clone());
         }
         let Some((info, _)) = found.get(index) else {
-            return Err(refused(format!(
-                "gpu:{index} was asked for, this machine has gpu:0 to gpu:{}",
-                found.len() - 1
-            )));
+            let last = found.len() - 1;
+            let others = if last == 0 { "only gpu:0".to_owned() } else { format!("gpu:0 to gpu:{last}") };
+            return Err(refused(format!("gpu:{index} was asked for, this machine has {others}")));
         };
         let same_kind = found[..index].iter().filter(|(i, _)| i.device_type == info.device_type).count();
         let kind = match info.device_type {
@@ -245,7 +262,7 @@ mod wgpu_adapters {
         };
         let options = Device::wgpu_options().device_kind(kind).graphics_api(api);
         let device = options.init().map_err(|e| refused(format!("gpu:{index} ({}): {e}", info.name)))?;
-        check_limits(&device)?;
+        check_device(&device)?;
         opened.push((index, device.clone()));
         Ok(device)
     }

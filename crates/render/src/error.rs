@@ -51,11 +51,17 @@ pub enum Error {
 }
 
 impl Error {
-    /// What the driver of a GPU says, without the backtrace that comes with it.
+    /// What the driver of a GPU says: its first sentences, without the chain of consequences and the backtrace.
     pub fn device(cause: &dyn std::fmt::Display) -> Self {
+        const MAX_CHARS: usize = 240;
         let text = cause.to_string();
-        let message = text.split("\nBacktrace").next().unwrap_or_default();
-        Self::Device { message: message.split_whitespace().collect::<Vec<_>>().join(" ") }
+        let first = text.split("\nBacktrace").next().unwrap_or_default();
+        let mut message = first.split_whitespace().collect::<Vec<_>>().join(" ");
+        if let Some((end, _)) = message.char_indices().nth(MAX_CHARS) {
+            message.truncate(end);
+            message.push('…');
+        }
+        Self::Device { message }
     }
 
     /// What a person can do about the error, if there is something to suggest.
@@ -75,5 +81,17 @@ impl Error {
             ),
             Self::Shape { .. } | Self::Parameter { .. } => None,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Error;
+
+    #[test]
+    fn what_a_driver_says_is_cut_to_its_first_sentences() {
+        let said = |text: &str| Error::device(&text).to_string();
+        assert_eq!(said("lost\nCaused by:\n  a fall\nBacktrace:\n 1 2 3"), "the GPU stopped: lost Caused by: a fall");
+        assert!(said(&"ä ".repeat(500)).ends_with('…') && said(&"ä ".repeat(500)).chars().count() < 300);
     }
 }

@@ -22,8 +22,9 @@ pub const UNITS: u32 = 256;
 /// Storage buffers a kernel of ours is given at most, with the one that carries its sizes: WebGPU's default.
 pub const MAX_BUFFERS: u32 = 8;
 
-/// Workgroup memory that the largest kernel takes, bytes: WebGPU's default.
-pub const SHARED_BYTES: usize = 16 * 1024;
+/// Workgroup memory that the largest kernel may take, bytes: above WebGPU's default of 16 KiB, since the backward
+/// rasteriser would otherwise reduce four splats at a time instead of eight; every desktop driver has 32 KiB.
+pub const SHARED_BYTES: usize = 24 * 1024;
 
 /// Where kernels are launched and buffers live.
 #[derive(Clone)]
@@ -148,18 +149,27 @@ pub fn contiguous(tensor: CubeTensor) -> CubeTensor {
     into_contiguous(tensor)
 }
 
-/// Checks that an adapter has what every kernel needs.
+/// Checks that an opened adapter has what every kernel needs.
+///
+/// # Errors
+/// As [`check_limits`].
+pub(crate) fn check_device(device: &Device) -> Result<()> {
+    let Some(gpu) = Gpu::from_device(device) else { return Ok(()) };
+    let has = &gpu.client.properties().hardware;
+    // The client has kept one buffer for the sizes of the others.
+    check_limits(has.max_units_per_cube, has.max_bindings.saturating_add(1), has.max_shared_memory_size)
+}
+
+/// Checks that an adapter with so many units and so many bytes of memory in a workgroup, and so many storage buffers in
+/// a kernel, has what every kernel needs.
 ///
 /// # Errors
 /// [`Error::Limit`] naming the first thing it has too little of.
-pub(crate) fn check_limits(device: &Device) -> Result<()> {
-    let Some(gpu) = Gpu::from_device(device) else { return Ok(()) };
-    let has = &gpu.client.properties().hardware;
+pub fn check_limits(units: u32, buffers: u32, shared_bytes: usize) -> Result<()> {
     let limits = [
-        ("units of a workgroup", u64::from(UNITS), u64::from(has.max_units_per_cube)),
-        // One is kept for the sizes of the others.
-        ("storage buffers of a kernel", u64::from(MAX_BUFFERS - 1), u64::from(has.max_bindings)),
-        ("bytes of workgroup memory", SHARED_BYTES as u64, has.max_shared_memory_size as u64),
+        ("units of a workgroup", u64::from(UNITS), u64::from(units)),
+        ("storage buffers of a kernel", u64::from(MAX_BUFFERS), u64::from(buffers)),
+        ("bytes of workgroup memory", SHARED_BYTES as u64, shared_bytes as u64),
     ];
     match limits.into_iter().find(|(_, needed, limit)| needed > limit) {
         Some((what, needed, limit)) => Err(Error::Limit { what, needed, limit }),
@@ -176,5 +186,24 @@ pub mod device_fn {
     #[cube]
     pub fn is_finite(x: f32) -> bool {
         (u32::reinterpret(x) & 0x7f80_0000u32) != 0x7f80_0000u32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{Error, check_limits};
+
+    #[test]
+    fn defaults_of_webgpu_suffice_and_less_is_named() {
+        // https://www.w3.org/TR/webgpu/#limits
+        assert_eq!(check_limits(256, 8, 16_384), Ok(()));
+        for (units, buffers, shared, named) in [
+            (128, 8, 16_384, ("units of a workgroup", 256, 128)),
+            (256, 4, 16_384, ("storage buffers of a kernel", 8, 4)),
+            (256, 8, 8192, ("bytes of workgroup memory", 16_384, 8192)),
+        ] {
+            let (what, needed, limit) = named;
+            assert_eq!(check_limits(units, buffers, shared), Err(Error::Limit { what, needed, limit }));
+        }
     }
 }

@@ -1,5 +1,6 @@
 //! A Gaussian model as tensors.
 
+use crate::error::{Error, Result};
 use burn::tensor::{Device, Tensor, TensorData};
 use gazesplat_core::GaussianCloud;
 
@@ -20,33 +21,48 @@ pub struct Splats {
 
 impl Splats {
     /// Uploads `cloud` to `device`.
-    pub fn from_cloud(cloud: &GaussianCloud, device: &Device) -> Self {
+    ///
+    /// # Errors
+    /// [`Error::Limit`] when a GPU takes no tensor of that size.
+    pub fn from_cloud(cloud: &GaussianCloud, device: &Device) -> Result<Self> {
         let n = cloud.len();
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = crate::gpu::Gpu::from_device(device) {
+            // The largest of the five.
+            gpu.check_size("bytes of SH coefficients", &[n, cloud.num_coefficients(), 3], burn::tensor::DType::F32)?;
+        }
         let flat = |rows: &[[f32; 3]]| rows.as_flattened().to_vec();
         let sh_shape = [n, cloud.num_coefficients(), 3];
-        Self {
+        Ok(Self {
             means: Tensor::from_data(TensorData::new(flat(&cloud.means), [n, 3]), device),
             quats: Tensor::from_data(TensorData::new(cloud.quats.as_flattened().to_vec(), [n, 4]), device),
             log_scales: Tensor::from_data(TensorData::new(flat(&cloud.log_scales), [n, 3]), device),
             opacity_logits: Tensor::from_data(TensorData::new(cloud.opacity_logits.clone(), [n]), device),
             sh: Tensor::from_data(TensorData::new(flat(&cloud.sh), sh_shape), device),
-        }
+        })
     }
 
     /// Downloads the model.
-    pub fn to_cloud(&self) -> GaussianCloud {
-        fn rows<const D: usize, const W: usize>(tensor: &Tensor<D>) -> Vec<[f32; W]> {
-            let data = tensor.to_data().to_vec::<f32>().expect("splat parameters are f32");
-            data.as_chunks().0.to_vec()
+    ///
+    /// # Errors
+    /// [`Error::Device`] when a GPU does not answer.
+    pub fn to_cloud(&self) -> Result<GaussianCloud> {
+        fn values<const D: usize>(tensor: &Tensor<D>) -> Result<Vec<f32>> {
+            let data = tensor.try_to_data().map_err(|e| Error::device(&e))?;
+            // A GPU copies on the first access: that can fail, too.
+            data.try_into_vec().map_err(|e| Error::device(&e))
         }
-        GaussianCloud {
-            means: rows(&self.means),
-            quats: rows(&self.quats),
-            log_scales: rows(&self.log_scales),
-            opacity_logits: self.opacity_logits.to_data().to_vec().expect("splat parameters are f32"),
+        fn rows<const D: usize, const W: usize>(tensor: &Tensor<D>) -> Result<Vec<[f32; W]>> {
+            Ok(values(tensor)?.as_chunks().0.to_vec())
+        }
+        Ok(GaussianCloud {
+            means: rows(&self.means)?,
+            quats: rows(&self.quats)?,
+            log_scales: rows(&self.log_scales)?,
+            opacity_logits: values(&self.opacity_logits)?,
             sh_degree: self.sh_degree(),
-            sh: rows(&self.sh),
-        }
+            sh: rows(&self.sh)?,
+        })
     }
 
     /// Number of Gaussians N.

@@ -8,6 +8,7 @@ mod finite_diff;
 mod golden;
 mod golden_work_stats;
 mod gpu_equals_cpu;
+mod lost_device;
 mod random_values;
 mod stability;
 mod stability_limits;

@@ -45,7 +45,7 @@ fn more_pairs_than_a_gpu_buffer_indexes_are_correct_or_refused() {
         push(&mut cloud, [0.0, 0.0, 1.0 + 1e-3 * i as f32], [11.5; 3], 2.0, [0.9, 0.4, 0.1]);
     }
     let scene = Scene { cloud, camera: camera(TALL, 1, 60.0), options: options() };
-    match render(&Splats::from_cloud(&scene.cloud, &device()), &scene.camera, &scene.options) {
+    match render(&Splats::from_cloud(&scene.cloud, &device()).expect("it fits"), &scene.camera, &scene.options) {
         Ok(out) => {
             assert!(out.stats.num_pairs >= 1 << 25, "{} pairs", out.stats.num_pairs);
             let image: Vec<f32> = out.image.into_data().try_to_vec().expect("images are f32");

@@ -59,6 +59,12 @@ impl TrainSection {
         let upper = (self.steps / 6).max(least).max(1);
         (self.eval_every > 0).then(|| self.eval_every.min(upper))
     }
+
+    /// Whether step `step`, counted from 1, is logged or followed by a measurement of `num_test` test views.
+    pub fn is_reported(&self, step: u32, num_test: usize) -> bool {
+        let is_measured = self.eval_interval(num_test).is_some_and(|interval| step.is_multiple_of(interval));
+        is_measured || crate::event::is_logged(step, self.steps, self.log_every)
+    }
 }
 
 /// Which images, at which size.

@@ -1,10 +1,10 @@
 //! What a training run tells the outside.
 
 use crate::evaluate::EvalReport;
-use crate::losses::LossTerm;
+use crate::losses::LossTerms;
 use serde::Serialize;
 
-/// Milliseconds spent in the stages of one step.
+/// Milliseconds spent in the stages of one step; on a GPU to queue their work, and to wait where something is read back.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct StageMs {
     /// Getting the photograph (decoding, when it was not in memory).
@@ -30,14 +30,9 @@ pub struct StepReport {
     pub step: u32,
     /// Steps of the whole run.
     pub num_steps: u32,
-    /// The image loss that was minimised.
-    pub loss: f32,
-    /// Mean absolute difference.
-    pub l1: f32,
-    /// Mean SSIM.
-    pub ssim: f32,
-    /// All terms, unweighted: those of the image, then the regularisers.
-    pub terms: Vec<LossTerm>,
+    /// The image loss that was minimised, and all terms, unweighted: those of the image, then the regularisers. On a GPU
+    /// only in the steps that [`crate::config::TrainSection::is_reported`]: reading them waits for the device.
+    pub losses: Option<LossTerms>,
     /// Gaussians after the step.
     pub num_gaussians: usize,
     /// SH degree that was rendered.
@@ -114,8 +109,13 @@ pub enum TrainEvent<'a> {
 impl StepReport {
     /// Whether a log that takes every `log_every`-th step takes this one: multiples, the first and the last.
     pub fn is_logged(&self, log_every: u32) -> bool {
-        self.step == 1 || self.step == self.num_steps || self.step.is_multiple_of(log_every.max(1))
+        is_logged(self.step, self.num_steps, log_every)
     }
+}
+
+/// [`StepReport::is_logged`] before there is a report.
+pub(crate) fn is_logged(step: u32, num_steps: u32, log_every: u32) -> bool {
+    step == 1 || step == num_steps || step.is_multiple_of(log_every.max(1))
 }
 
 /// Something that follows a run: progress bars, logs, reports.

@@ -4,6 +4,7 @@
 //! budget, evaluates on the way and tells [`Observer`]s what happens. Sources, as cited in the code: `3DGS` = Kerbl 2023,
 //! `MCMC` = Kheradmand 2024, Wang 2004 (SSIM), Kingma 2015 (Adam).
 
+pub mod backend;
 pub mod config;
 pub mod densify;
 pub mod error;
@@ -13,6 +14,11 @@ mod host;
 pub mod init;
 pub mod kernels;
 pub mod losses;
+#[cfg_attr(
+    feature = "gpu",
+    expect(missing_docs, reason = "the device-side twins that the macros generate carry no documentation")
+)]
+pub mod math;
 pub mod metrics;
 pub mod optim;
 pub mod rng;

@@ -3,6 +3,15 @@
 //!
 //! Philox4x32-10 (Salmon 2011, "Parallel random numbers: as easy as 1, 2, 3").
 
+#[cfg(feature = "gpu")]
+#[expect(missing_docs, reason = "what the kernel macros generate carries no documentation")]
+pub mod gpu;
+
+pub use crate::math::uniform;
+
+use crate::math;
+use gazesplat_render::math::vec::Vec3;
+
 /// What the numbers are for; streams do not overlap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u32)]
@@ -38,12 +47,6 @@ pub fn draw(seed: u64, stream: Stream, step: u32, index: u64) -> [u32; 4] {
     philox(counter, [seed as u32, (seed >> 32) as u32])
 }
 
-/// A word as a number in [0, 1).
-#[inline]
-pub fn uniform(word: u32) -> f32 {
-    (word >> 8) as f32 * (1.0 / (1u32 << 24) as f32)
-}
-
 /// Two words as a number in [0, 1) of 53 bits.
 #[inline]
 pub fn uniform_f64(high: u32, low: u32) -> f64 {
@@ -53,12 +56,8 @@ pub fn uniform_f64(high: u32, low: u32) -> f64 {
 /// Three independent standard normal numbers from four words (Box and Muller 1958).
 #[inline]
 pub fn normals(words: [u32; 4]) -> [f32; 3] {
-    // The radius takes 1 − u in (0, 1]: the logarithm stays finite.
-    let radius = |w: u32| (-2.0 * (1.0 - uniform(w)).ln()).sqrt();
-    let (sin_a, cos_a) = (std::f32::consts::TAU * uniform(words[1])).sin_cos();
-    let cos_b = (std::f32::consts::TAU * uniform(words[3])).cos();
-    let (ra, rb) = (radius(words[0]), radius(words[2]));
-    [ra * cos_a, ra * sin_a, rb * cos_b]
+    let Vec3 { x, y, z } = math::normals(words[0], words[1], words[2], words[3]);
+    [x, y, z]
 }
 
 /// A random order of 0..n (Fisher and Yates).

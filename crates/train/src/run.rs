@@ -36,7 +36,7 @@ pub fn run(trainer: &mut Trainer, observers: &mut [&mut dyn Observer], stop: &At
         observers,
         &TrainEvent::Started {
             num_steps,
-            num_gaussians: trainer.splats().len(),
+            num_gaussians: trainer.num_gaussians(),
             num_train: trainer.images().len(),
             num_test,
         },
@@ -56,7 +56,7 @@ pub fn run(trainer: &mut Trainer, observers: &mut [&mut dyn Observer], stop: &At
             emit(observers, &TrainEvent::Evaluated { step: report.step, report: &evaluated })?;
         }
     }
-    let finished = TrainEvent::Finished { step: trainer.step_index(), num_gaussians: trainer.splats().len() };
+    let finished = TrainEvent::Finished { step: trainer.step_index(), num_gaussians: trainer.num_gaussians() };
     emit(observers, &finished)?;
     Ok(Outcome::Finished)
 }

@@ -1,43 +1,46 @@
 //! The training step: a view, its image, the loss, gradients, Adam, densification.
 //!
-//! Parameters live in one set of tensors. A step puts them on a fresh autodiff graph, and when the graph is gone moves
-//! them to host vectors, updates them in place and moves them back: nothing of the model's size is copied. SH bands that
-//! are not learned yet are not stored, so that a young model is a quarter of the size of a grown one.
+//! The model and its moments stay on their device. A step puts the parameters on a fresh autodiff graph, and when the
+//! graph is gone updates them where they are: nothing of the model's size is copied. SH bands that are not learned yet
+//! are not stored, so that a young model is a quarter of the size of a grown one.
+//!
+//! On a GPU a step only queues work. The host reads the loss in the steps that are reported, and before it measures or
+//! ends; a loss that is not finite stops the model on the device at once, and the run at the next such read.
 
+use crate::backend::Status;
 use crate::config::{Background, Config, NamedBackground, StrategyKind};
 use crate::densify::{Fixed, Mcmc, StepContext, Strategy};
 use crate::error::{Error, Offender, Result};
 use crate::evaluate::{EvalReport, evaluate};
 use crate::event::{StageMs, StepReport};
 use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
-use crate::losses::{L1Ssim, LossTarget, WeightedLosses};
-use crate::optim::{Adam, AdamSettings, Columns, Group, LearningRates, Optimized, into_vec, schedule};
+use crate::kernels::cpu::rows::Rows;
+use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses};
+use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, schedule};
 use crate::rng::{Stream, draw, permutation, uniform};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Gradients, Tensor};
 use gazesplat_core::dataset::Dataset;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Camera, GaussianCloud, sh};
-use gazesplat_render::{Pass, RenderOptions, Splats, render};
+use gazesplat_render::{Pass, RenderOptions, Splats, is_gpu, render};
 use std::sync::Arc;
 use std::time::Instant;
 
 /// A model in training.
 pub struct Trainer {
     config: Config,
-    device: Device,
     images: Arc<ImageCache>,
     test_images: Arc<ImageCache>,
-    /// `None` only while a step updates the parameters.
-    splats: Option<Splats>,
-    /// `None` only while a step updates the parameters.
-    adam: Option<Adam>,
+    state: ModelState,
     strategy: Box<dyn Strategy>,
     /// Step at which the rows were last sorted.
     sorted_at: u32,
     losses: WeightedLosses,
+    center: [f32; 3],
     extent: f32,
     step: u32,
-    view_order: Vec<usize>,
+    /// The epoch whose order is held, and the order.
+    view_order: Option<(u32, Vec<usize>)>,
     messages: Vec<String>,
 }
 
@@ -72,29 +75,27 @@ impl Trainer {
         }
         let extent = positive_extent(dataset.scene_extent());
         let cameras: Vec<Camera> = images.views().iter().map(|v| v.camera).collect();
-        let center = camera_center(&cameras).into();
+        let center: [f32; 3] = camera_center(&cameras).into();
         let strategy: Box<dyn Strategy> = match config.densify.strategy {
             StrategyKind::Mcmc => Box::new(Mcmc::new(&config.densify, config.train.steps, cloud.len(), center, extent)),
             StrategyKind::None => Box::new(Fixed),
         };
-        let params = Columns::from_splats(Splats::from_cloud(cloud, device));
-        let adam = Adam::new(&params, AdamSettings::default());
-        let mut state = Optimized { params, adam };
-        state.sort_spatially();
+        // Sorted before they are uploaded: the host's order follows the box around the means, however far they reach.
+        let mut rows = Rows::new(Columns::from_cloud(cloud));
+        rows.sort_spatially();
         let losses = WeightedLosses::default().with(1.0, Box::new(L1Ssim { ssim_weight: config.loss.ssim_weight }));
         Ok(Self {
             test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
             config: config.clone(),
-            device: device.clone(),
             images,
-            splats: Some(state.params.into_splats(device)),
-            adam: Some(state.adam),
+            state: ModelState::new(rows.params, AdamSettings::default(), device)?,
             strategy,
             sorted_at: 0,
             losses,
+            center,
             extent,
             step: 0,
-            view_order: Vec::new(),
+            view_order: None,
             messages: Vec::new(),
         })
     }
@@ -104,9 +105,14 @@ impl Trainer {
         self.losses = std::mem::take(&mut self.losses).with(weight, loss);
     }
 
-    /// The model as it is now.
-    pub fn splats(&self) -> &Splats {
-        self.splats.as_ref().expect("only a step in progress takes the model")
+    /// The model as it is now; later steps leave these tensors as they are.
+    pub fn splats(&self) -> Splats {
+        self.state.splats()
+    }
+
+    /// Number of Gaussians N.
+    pub fn num_gaussians(&self) -> usize {
+        self.state.num_rows()
     }
 
     /// Steps done.
@@ -135,31 +141,35 @@ impl Trainer {
     }
 
     /// The model as it is exported: of the degree of the settings, Gaussians with a non-finite value left out.
-    pub fn to_cloud(&self) -> GaussianCloud {
-        let cloud = self.splats().to_cloud();
+    ///
+    /// # Errors
+    /// [`Error::Render`] when the device does not answer.
+    pub fn to_cloud(&self) -> Result<GaussianCloud> {
+        let cloud = self.state.lent().to_cloud()?;
         let cloud = cloud.with_sh_degree(cloud.sh_degree.max(self.config.model.sh_degree));
         let valid: Vec<usize> = (0..cloud.len()).filter(|&i| cloud.is_row_valid(i)).collect();
-        if valid.len() == cloud.len() { cloud } else { cloud.select(&valid) }
+        Ok(if valid.len() == cloud.len() { cloud } else { cloud.select(&valid) })
     }
 
     /// Quality on the test views.
     ///
     /// # Errors
-    /// As [`evaluate`].
-    pub fn evaluate(&self) -> Result<EvalReport> {
-        evaluate(self.splats(), &self.test_images, &self.config.render_options(), &mut |_, _| {})
+    /// As [`evaluate`]; on a GPU, [`Error::NonFiniteLoss`] of an earlier step.
+    pub fn evaluate(&mut self) -> Result<EvalReport> {
+        self.checked_status()?;
+        evaluate(&self.state.lent(), &self.test_images, &self.config.render_options(), &mut |_, _| {})
     }
 
     /// One step on the next view. Views come in a random order, each once before any comes again.
     ///
     /// # Errors
-    /// [`Error::NonFiniteLoss`]; [`Error::Scene`] when the photograph cannot be read; [`Error::Render`]. The model is
-    /// as it was before the step.
+    /// [`Error::NonFiniteLoss`], on a GPU of this step or one since the last report; [`Error::Scene`] when the photograph
+    /// cannot be read; [`Error::Render`]. The model is as it was before the step that failed.
     pub fn step(&mut self) -> Result<StepReport> {
         let mut clock = Clock::start();
         let mut stage_ms = StageMs::default();
         let num_steps = self.config.train.steps;
-        self.grow_sh();
+        self.grow_sh()?;
         let view = self.view_at(self.step);
         let photo = self.images.get(view)?;
         let next = self.view_at(self.step + 1);
@@ -169,102 +179,98 @@ impl Trainer {
         stage_ms.image = clock.lap();
 
         let options = RenderOptions { background, pass: Pass::Train, ..self.config.render_options() };
-        let leaves = tracked(self.splats());
+        let leaves = tracked(&self.state.lent());
         let rendered = render(&leaves, &self.images.views()[view].camera, &options)?;
         stage_ms.forward = clock.lap();
 
         let pending = self.losses.evaluate(rendered.image, &target).expect("a trainer has a loss");
-        let report = pending.read()?;
-        if !report.total.is_finite() {
-            drop((pending, leaves));
-            return Err(self.non_finite(view, report.total));
-        }
         stage_ms.loss = clock.lap();
 
-        let mut gradients = pending.loss.backward();
-        let Splats { means, quats, log_scales, opacity_logits, sh } = leaves;
-        let mut grads = Columns {
-            data: [
-                taken(means, &mut gradients),
-                taken(quats, &mut gradients),
-                taken(log_scales, &mut gradients),
-                taken(opacity_logits, &mut gradients),
-                taken(sh, &mut gradients),
-            ],
-            widths: [0; 5],
-        };
-        drop(gradients);
+        let gradients = taken(leaves, pending.loss.backward());
         stage_ms.backward = clock.lap();
 
-        let params = Columns::from_splats(self.splats.take().expect("only a step in progress takes the model"));
-        let adam = self.adam.take().expect("only a step in progress takes the optimiser");
-        let mut state = Optimized { params, adam };
-        grads.widths = state.params.widths;
-        let mut terms = report.terms.clone();
-        terms.extend(self.strategy.regularize(&state.params, &mut grads));
+        // On the CPU the values are there; a GPU is waited for only when somebody will see them.
+        let is_read =
+            !is_gpu(self.state.device()) || self.config.train.is_reported(self.step + 1, self.test_images.len());
         let rates = LearningRates::at(&self.config.optim, self.step, num_steps, self.extent);
-        state.adam.update(&mut state.params, &grads, &rates);
-        drop(grads);
+        let regularizers = self.strategy.regularizers();
+        self.state.update(gradients, pending.total(), rates, regularizers, is_read)?;
+        self.step += 1;
+        let losses = if is_read {
+            let status = self.checked_status()?;
+            let mut losses = pending.read()?;
+            losses.terms.extend(regularizer_terms(regularizers, &status));
+            Some(losses)
+        } else {
+            None
+        };
+        drop(pending);
         stage_ms.optim = clock.lap();
 
-        self.step += 1;
         let context = StepContext { step: self.step, seed: self.config.train.seed, means_lr: rates.means };
-        let densified = self.strategy.after_update(&mut state, &context);
+        let densified = self.strategy.after_update(&mut self.state, &context)?;
         if densified.is_some() && self.step >= self.sorted_at + SORT_INTERVAL {
-            state.sort_spatially();
+            self.state.sort_spatially(self.center, SORT_EXTENTS * self.extent)?;
             self.sorted_at = self.step;
         }
-        let num_gaussians = state.num_rows();
-        let num_coefficients = state.params.widths[Group::Sh as usize] / 3;
-        self.splats = Some(state.params.into_splats(&self.device));
-        self.adam = Some(state.adam);
         stage_ms.densify = clock.lap();
         stage_ms.total = clock.total();
         Ok(StepReport {
             step: self.step,
             num_steps,
-            loss: report.total,
-            l1: report.get("l1").unwrap_or(f32::NAN),
-            ssim: report.get("ssim").unwrap_or(f32::NAN),
-            terms,
-            num_gaussians,
-            sh_degree: sh::degree_from_coefficients(num_coefficients).unwrap_or(0),
+            losses,
+            num_gaussians: self.state.num_rows(),
+            sh_degree: sh::degree_from_coefficients(self.state.num_coefficients()).unwrap_or(0),
             stage_ms,
             view: self.images.views()[view].name.clone(),
             densified,
         })
     }
 
+    /// The status of the model.
+    ///
+    /// # Errors
+    /// [`Error::NonFiniteLoss`] of the step that closed it; the trainer is then where it was before that step.
+    fn checked_status(&mut self) -> Result<Status> {
+        let status = self.state.status()?;
+        let Some((step, loss)) = status.failed else { return Ok(status) };
+        self.step = step - 1;
+        self.state.reopen(step - 1);
+        let view = self.view_at(step - 1);
+        let suspect = Columns::from_splats(self.state.lent())?.most_suspect();
+        Err(Error::NonFiniteLoss {
+            step,
+            view: self.images.views()[view].name.clone(),
+            loss,
+            offender: suspect.map(|(gaussian, group, value)| Offender { gaussian, parameter: group.name(), value }),
+        })
+    }
+
     /// Adds the SH bands that are due.
-    fn grow_sh(&mut self) {
+    fn grow_sh(&mut self) -> Result<()> {
         let optim = &self.config.optim;
         let degree =
             schedule::sh_degree(self.step, self.config.train.steps, optim.sh_degree_every, self.config.model.sh_degree);
         let num_coefficients = sh::num_coefficients(degree);
-        if num_coefficients <= self.splats().sh.dims()[1] {
-            return;
+        match num_coefficients > self.state.num_coefficients() {
+            true => self.state.widen_sh(num_coefficients),
+            false => Ok(()),
         }
-        let params = Columns::from_splats(self.splats.take().expect("only a step in progress takes the model"));
-        let adam = self.adam.take().expect("only a step in progress takes the optimiser");
-        let mut state = Optimized { params, adam };
-        state.widen_sh(num_coefficients);
-        self.splats = Some(state.params.into_splats(&self.device));
-        self.adam = Some(state.adam);
     }
 
     /// The view of step `step`, counted from 0.
     fn view_at(&mut self, step: u32) -> usize {
         let num_views = self.images.len() as u32;
         let (epoch, position) = (step / num_views, (step % num_views) as usize);
-        let seed = self.config.train.seed;
-        if position == 0 && step != self.step {
-            // A look ahead into the next epoch; the order of this one is still needed.
-            return permutation(self.images.len(), seed, Stream::ViewOrder, epoch)[0];
+        if self.view_order.as_ref().is_none_or(|(held, _)| *held != epoch) {
+            let order = permutation(self.images.len(), self.config.train.seed, Stream::ViewOrder, epoch);
+            if step != self.step {
+                // A look ahead into the next epoch; the order of this one is still needed.
+                return order[position];
+            }
+            self.view_order = Some((epoch, order));
         }
-        if position == 0 || self.view_order.is_empty() {
-            self.view_order = permutation(self.images.len(), seed, Stream::ViewOrder, epoch);
-        }
-        self.view_order[position]
+        self.view_order.as_ref().map_or(0, |(_, order)| order[position])
     }
 
     fn background(&self) -> [f32; 3] {
@@ -274,16 +280,6 @@ impl Trainer {
                 [uniform(words[0]), uniform(words[1]), uniform(words[2])]
             }
             fixed => fixed.fixed_rgb(),
-        }
-    }
-
-    fn non_finite(&self, view: usize, loss: f32) -> Error {
-        let suspect = Columns::from_splats(self.splats().clone()).most_suspect();
-        Error::NonFiniteLoss {
-            step: self.step + 1,
-            view: self.images.views()[view].name.clone(),
-            loss,
-            offender: suspect.map(|(gaussian, group, value)| Offender { gaussian, parameter: group.name(), value }),
         }
     }
 }
@@ -300,14 +296,33 @@ fn tracked(splats: &Splats) -> Splats {
     .require_grad()
 }
 
-/// The gradient of a leaf; empty when nothing reached it.
-fn taken<const D: usize>(leaf: Tensor<D>, gradients: &mut burn::tensor::Gradients) -> Vec<f32> {
-    leaf.grad_remove(gradients).map_or_else(Vec::new, into_vec)
+/// The gradients of the leaves; zero for one that nothing reached. The graph is gone afterwards.
+fn taken(leaves: Splats, mut gradients: Gradients) -> Splats {
+    fn of<const D: usize>(leaf: Tensor<D>, gradients: &mut Gradients) -> Tensor<D> {
+        leaf.grad_remove(gradients).unwrap_or_else(|| leaf.inner().zeros_like())
+    }
+    Splats {
+        means: of(leaves.means, &mut gradients),
+        quats: of(leaves.quats, &mut gradients),
+        log_scales: of(leaves.log_scales, &mut gradients),
+        opacity_logits: of(leaves.opacity_logits, &mut gradients),
+        sh: of(leaves.sh, &mut gradients),
+    }
+}
+
+/// What the regularisers in use come to, unweighted.
+fn regularizer_terms(weights: Regularizers, status: &Status) -> impl Iterator<Item = LossTerm> {
+    let opacity = LossTerm { name: "opacity_regularizer", value: status.mean_opacity };
+    let scale = LossTerm { name: "scale_regularizer", value: status.mean_scale };
+    [(weights.opacity, opacity), (weights.scale, scale)].into_iter().filter(|(w, _)| *w > 0.0).map(|(_, term)| term)
 }
 
 /// Steps between two sortings of the rows. Densification puts new rows at the end and elsewhere in space; neighbours
 /// in memory that are neighbours in the image halve the time of the backward pass, and one sorting costs about a step.
 const SORT_INTERVAL: u32 = 200;
+/// Half the cube a GPU sorts in, in scene extents: its cells are then a hundredth of an extent wide, about a tile's
+/// reach, and what is farther is rarely near anything in the image.
+const SORT_EXTENTS: f32 = 4.0;
 
 /// Milliseconds since the last lap and since the start.
 struct Clock {
@@ -357,13 +372,7 @@ mod tests {
         let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
         let mut trainer =
             Trainer::new(&dataset, images, &config, &gazesplat_render::cpu_device()).expect("the test sets this up");
-        let addresses = |trainer: &mut Trainer| {
-            let params = Columns::from_splats(trainer.splats.take().expect("the test sets this up"));
-            let adam = trainer.adam.as_ref().expect("the test sets this up");
-            let found = [&params, &adam.first, &adam.second].map(|c| c.data.each_ref().map(|d| d.as_ptr() as usize));
-            trainer.splats = Some(params.into_splats(&trainer.device));
-            found
-        };
+        let addresses = |trainer: &mut Trainer| trainer.state.addresses();
         let before = addresses(&mut trainer);
         for _ in 0..3 {
             trainer.step().expect("the test sets this up");

@@ -2,12 +2,16 @@
 
 #![expect(clippy::unwrap_used, reason = "a helper of a test may panic like the test")]
 
+use burn::tensor::Device;
+use gazesplat_core::GaussianCloud;
 use gazesplat_core::dataset::{Dataset, SparsePoints};
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::synthetic::{SynthOptions, write_scene};
-use gazesplat_render::cpu_device;
+use gazesplat_render::{cpu_device, device::gpu_device};
+use gazesplat_testkit::devices::required_gpu;
+use gazesplat_train::config::StrategyKind;
 use gazesplat_train::event::{Observer, TrainEvent};
-use gazesplat_train::{Config, Error, Outcome, Trainer, run, with_threads};
+use gazesplat_train::{Config, Error, Outcome, Trainer, evaluate, run, with_threads};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -52,14 +56,22 @@ fn config(steps: u32, cap: usize) -> Config {
 }
 
 fn trainer(dataset: &Dataset, config: &Config) -> Trainer {
+    trainer_on(dataset, config, &cpu_device())
+}
+
+fn trainer_on(dataset: &Dataset, config: &Config, device: &Device) -> Trainer {
     let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
-    Trainer::new(dataset, images, config, &cpu_device()).unwrap()
+    Trainer::new(dataset, images, config, device).unwrap()
 }
 
 /// What a run said.
 #[derive(Default)]
 struct Log {
     losses: Vec<f32>,
+    /// Steps whose losses were told.
+    told: Vec<u32>,
+    /// Names of the terms of the first loss.
+    terms: Vec<&'static str>,
     messages: Vec<String>,
     psnr: Option<f64>,
     num_densified: usize,
@@ -69,7 +81,13 @@ struct Log {
 impl Observer for Log {
     fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         match event {
-            TrainEvent::Step(report) => self.losses.push(report.loss),
+            TrainEvent::Step(report) => {
+                if let Some(losses) = &report.losses {
+                    self.losses.push(losses.total);
+                    self.told.push(report.step);
+                    self.terms = losses.terms.iter().map(|term| term.name).collect();
+                }
+            }
             TrainEvent::Message(text) => self.messages.push((*text).to_string()),
             TrainEvent::Evaluated { report, .. } => self.psnr = Some(report.psnr),
             TrainEvent::Densified { .. } => self.num_densified += 1,
@@ -93,7 +111,7 @@ fn a_short_run_on_the_room_reaches_its_quality_floor() {
     let psnr = log.psnr.unwrap();
     println!("test PSNR {:.2} dB, before training {:.2} dB", psnr, before.psnr);
     assert!(psnr > PSNR_FLOOR_DB && psnr > before.psnr + 3.0, "{psnr} {}", before.psnr);
-    let cloud = trainer.to_cloud();
+    let cloud = trainer.to_cloud().unwrap();
     assert_eq!((cloud.len(), cloud.sh_degree), (6000, 3));
     cloud.validate().unwrap();
 }
@@ -110,7 +128,7 @@ fn the_model_does_not_depend_on_the_number_of_threads() {
             with_threads(threads, || {
                 let mut trainer = trainer(&dataset, &config(60, 3000));
                 run(&mut trainer, &mut [], &AtomicBool::new(false)).unwrap();
-                trainer.to_cloud()
+                trainer.to_cloud().unwrap()
             })
             .unwrap()
         })
@@ -131,7 +149,7 @@ fn a_stopped_run_continues_to_the_model_of_an_unbroken_one() {
     assert_eq!(run(&mut stopped, &mut [], &AtomicBool::new(true)).unwrap(), Outcome::Stopped);
     assert_eq!(stopped.step_index(), 17);
     run(&mut stopped, &mut [], &AtomicBool::new(false)).unwrap();
-    assert!(stopped.to_cloud() == unbroken.to_cloud());
+    assert!(stopped.to_cloud().unwrap() == unbroken.to_cloud().unwrap());
 }
 
 #[test]
@@ -148,24 +166,84 @@ fn a_scene_without_points_starts_at_random_and_says_so() {
     assert!(log.losses.last() < log.losses.first());
 }
 
+/// 200 steps on both kinds of device: what was said, the PSNR on the training views and the model, CPU first.
+fn on_cpu_and_gpu(name: &str, config: &Config) -> Option<[(Log, f64, GaussianCloud); 2]> {
+    let gpu = required_gpu(gpu_device(None))?;
+    let (_scratch, dataset) = scene(name, 12);
+    Some([cpu_device(), gpu].map(|device| {
+        let mut trainer = trainer_on(&dataset, config, &device);
+        let mut log = Log::default();
+        run(&mut trainer, &mut [&mut log], &AtomicBool::new(false)).unwrap();
+        let options = config.render_options();
+        let trained = evaluate(&trainer.splats(), trainer.images(), &options, &mut |_, _| {}).unwrap();
+        let cloud = trainer.to_cloud().unwrap();
+        cloud.validate().unwrap();
+        (log, trained.psnr, cloud)
+    }))
+}
+
+#[test]
+fn a_gpu_optimises_to_the_quality_of_the_cpu() {
+    let mut settings = config(200, 3000);
+    settings.densify.strategy = StrategyKind::None;
+    let Some([(cpu, cpu_trained, _), (gpu, gpu_trained, _)]) = on_cpu_and_gpu("gpu", &settings) else { return };
+    let (expected, found) = (cpu.psnr.unwrap(), gpu.psnr.unwrap());
+    println!("test PSNR: CPU {expected:.3} dB, GPU {found:.3} dB; training: {cpu_trained:.3}, {gpu_trained:.3} dB");
+    // Measured on software Vulkan: within 0.003 dB for three seeds.
+    assert!((found - expected).abs() < 0.1 && (gpu_trained - cpu_trained).abs() < 0.1);
+    // The CPU tells every step, a GPU the first and those that are logged or measured.
+    assert_eq!(cpu.told, (1..=200).collect::<Vec<_>>());
+    assert!(gpu.told.len() < 40 && [1, 10, 100, 200].iter().all(|step| gpu.told.contains(step)), "{:?}", gpu.told);
+    assert!((gpu.losses[0] / cpu.losses[0] - 1.0).abs() < 1e-4, "{} {}", gpu.losses[0], cpu.losses[0]);
+}
+
+#[test]
+fn a_gpu_densifies_to_the_quality_of_the_cpu() {
+    // Long enough for the rows to be sorted once on the device.
+    let settings = config(250, 3000);
+    let Some([(cpu, cpu_trained, cpu_cloud), (gpu, gpu_trained, gpu_cloud)]) = on_cpu_and_gpu("mcmc", &settings) else {
+        return;
+    };
+    println!("training PSNR: CPU {cpu_trained:.3} dB, GPU {gpu_trained:.3} dB");
+    // The same draws, but one rounding is enough for another source: from there on it is another run. Three seeds on the
+    // CPU lie within 0.11 dB of each other; the GPU was within 0.09 dB of the CPU for each of them.
+    assert!((gpu_trained - cpu_trained).abs() < 0.3);
+    assert_eq!((gpu_cloud.len(), gpu_cloud.sh_degree), (cpu_cloud.len(), cpu_cloud.sh_degree));
+    assert_eq!((gpu_cloud.len(), gpu.num_densified), (3000, cpu.num_densified));
+    assert_eq!(gpu.terms, cpu.terms);
+}
+
 #[test]
 fn a_loss_that_is_no_number_stops_the_run_and_keeps_the_model() {
     let (_scratch, dataset) = scene("nan", 4);
-    let settings = config(10, 2500);
-    let mut cloud = trainer(&dataset, &settings).to_cloud();
+    let mut settings = config(10, 2500);
+    let mut cloud = trainer(&dataset, &settings).to_cloud().unwrap();
     cloud.sh[16 * 7] = [f32::MAX; 3];
-    let images = Arc::new(ImageCache::new(dataset.train.clone(), settings.data.cache_bytes));
-    let mut trainer = Trainer::from_cloud(&cloud, &dataset, images, &settings, &cpu_device()).unwrap();
-    // Views that do not see the Gaussian pass.
-    let (before, error) = (0..10)
-        .find_map(|_| {
-            let before = trainer.to_cloud();
-            trainer.step().err().map(|error| (before, error))
+    // The device of a GPU stops the model by itself: the host may look at the end only.
+    settings.train.log_every = 100;
+    let mut devices = vec![cpu_device()];
+    devices.extend(required_gpu(gpu_device(None)));
+    let failed: Vec<_> = devices
+        .iter()
+        .map(|device| {
+            let images = Arc::new(ImageCache::new(dataset.train.clone(), settings.data.cache_bytes));
+            let mut trainer = Trainer::from_cloud(&cloud, &dataset, images, &settings, device).unwrap();
+            let error = run(&mut trainer, &mut [], &AtomicBool::new(false)).unwrap_err();
+            let message = error.to_string();
+            assert!(message.contains("view_00") && message.contains("sh of Gaussian 7"), "{message}");
+            let Error::NonFiniteLoss { step, .. } = error else { panic!("{message}") };
+            assert_eq!(trainer.step_index(), step - 1);
+            let model = trainer.to_cloud().unwrap();
+            // Views that do not see the Gaussian pass: the model is that of a run which stops before the step.
+            let images = Arc::new(ImageCache::new(dataset.train.clone(), settings.data.cache_bytes));
+            let mut unbroken = Trainer::from_cloud(&cloud, &dataset, images, &settings, device).unwrap();
+            (1..step).for_each(|_| drop(unbroken.step().unwrap()));
+            assert!(model == unbroken.to_cloud().unwrap(), "{message}");
+            assert!(matches!(trainer.step(), Err(Error::NonFiniteLoss { .. })) || step > 1);
+            (step, message)
         })
-        .unwrap();
-    let message = error.to_string();
-    assert!(message.contains("view_00") && message.contains("sh of Gaussian 7"), "{message}");
-    assert!(trainer.to_cloud() == before);
+        .collect();
+    assert!(failed.windows(2).all(|w| w[0] == w[1]), "{failed:?}");
 }
 
 #[cfg(feature = "flex")]
@@ -173,11 +251,11 @@ fn a_loss_that_is_no_number_stops_the_run_and_keeps_the_model() {
 fn both_cpu_backends_train_the_same_model() {
     let (_scratch, dataset) = scene("flex", 5);
     let settings = config(12, 2500);
-    let train = |device: &burn::tensor::Device| {
+    let train = |device: &Device| {
         let images = Arc::new(ImageCache::new(dataset.train.clone(), settings.data.cache_bytes));
         let mut trainer = Trainer::new(&dataset, images, &settings, device).unwrap();
         run(&mut trainer, &mut [], &AtomicBool::new(false)).unwrap();
-        trainer.to_cloud()
+        trainer.to_cloud().unwrap()
     };
     assert!(train(&cpu_device()) == train(&gazesplat_render::flex_device()));
 }

@@ -1,9 +1,10 @@
-//! SSIM and Adam against the golden records (float64, torch): the loss on every device, Adam on the CPU.
+//! SSIM and Adam against the golden records (float64, torch), on the CPU and on a GPU.
 
+use burn::tensor::Tensor;
 use gazesplat_render::simd::SimdLevel;
 use gazesplat_testkit::golden;
 use gazesplat_train::kernels::cpu::l1_ssim::{Comparison, Similarity, Weights, similarity, similarity_and_gradient};
-use gazesplat_train::optim::adam::{AdamSettings, Step, update};
+use gazesplat_train::optim::{AdamSettings, Columns, Group, LearningRates, ModelState, Regularizers};
 
 /// f32 arithmetic on images of up to 56 × 40: the sums themselves are exact to about 1e-7.
 const VALUE_TOLERANCE: f64 = 1e-6;
@@ -94,7 +95,9 @@ fn golden_ssim_on_the_gpu() {
 }
 
 #[test]
-fn golden_adam_follows_torch_over_all_steps() {
+fn golden_adam_follows_torch_over_all_steps_on_every_device() {
+    let mut devices = vec![gazesplat_render::cpu_device()];
+    devices.extend(gazesplat_testkit::devices::required_gpu(gazesplat_render::device::gpu_device(None)));
     let golden = golden::find("adam").expect("golden record adam").load();
     let settings = golden.json.as_object().expect("an object");
     let mut num_settings = 0;
@@ -108,26 +111,54 @@ fn golden_adam_follows_torch_over_all_steps() {
             weight_decay: number(entry["weight_decay"].as_f64()),
         };
         let lr = number(entry["lr"].as_f64());
+        let rate = lr as f32;
+        let rates = LearningRates {
+            means: rate,
+            quats: rate,
+            log_scales: rate,
+            opacity_logits: rate,
+            sh_dc: rate,
+            sh_rest: rate,
+        };
         let to_f32 = |values: Vec<f64>| values.into_iter().map(|v| v as f32).collect::<Vec<f32>>();
-        let mut params = to_f32(golden.f64(&format!("{name}.param0")));
+        let start = to_f32(golden.f64(&format!("{name}.param0")));
         let grads = to_f32(golden.f64(&format!("{name}.grads")));
         let expected = golden.f64(&format!("{name}.params"));
-        let n = params.len();
-        let (mut first, mut second) = (vec![0.0; n], vec![0.0; n]);
-        for (t, (grads, expected)) in grads.chunks_exact(n).zip(expected.chunks_exact(n)).enumerate() {
-            update(&mut params, grads, &mut first, &mut second, &[lr as f32; 3], &Step::new(&adam, t as u32 + 1));
-            for (found, expected) in params.iter().zip(expected) {
-                let error = (f64::from(*found) - expected).abs();
-                // One rounding of the parameter per step, and the update itself to f32 precision.
-                let tolerance = (t + 1) as f64 * (1.2e-7 * expected.abs() + 1e-5 * lr);
-                assert!(error <= tolerance, "{name} step {t}: {found} {expected}");
+        let n = start.len();
+        for device in &devices {
+            let mut state = ModelState::new(in_three_groups(&start), adam, device).expect("it fits");
+            for (t, (grads, expected)) in grads.chunks_exact(n).zip(expected.chunks_exact(n)).enumerate() {
+                let loss = Tensor::<1>::ones([1], device);
+                let grads = in_three_groups(grads).into_splats(device);
+                state.update(grads, loss, rates, Regularizers::default(), false).expect("the device answers");
+                let found = Columns::from_splats(state.splats()).expect("the device answers");
+                for group in THREE_GROUPS {
+                    for (found, expected) in found.of(group).iter().zip(expected) {
+                        let error = (f64::from(*found) - expected).abs();
+                        // One rounding of the parameter per step, and the update itself to f32 precision.
+                        let tolerance = (t + 1) as f64 * (1.2e-7 * expected.abs() + 1e-5 * lr);
+                        assert!(error <= tolerance, "{name} {group:?} step {t}: {found} {expected}");
+                    }
+                }
             }
-        }
-        for (moments, key) in [(&first, "m"), (&second, "v")] {
-            for (found, expected) in moments.iter().zip(golden.f64(&format!("{name}.{key}"))) {
-                assert!((f64::from(*found) - expected).abs() <= 2e-6 * expected.abs() + 1e-12, "{name} {key}");
+            for (moments, key) in state.moments().expect("the device answers").iter().zip(["m", "v"]) {
+                for group in THREE_GROUPS {
+                    for (found, expected) in moments.of(group).iter().zip(golden.f64(&format!("{name}.{key}"))) {
+                        let error = (f64::from(*found) - expected).abs();
+                        assert!(error <= 2e-6 * expected.abs() + 1e-12, "{name} {group:?} {key}");
+                    }
+                }
             }
         }
     }
     assert!(num_settings > 0, "no settings in the golden record");
+}
+
+/// The groups whose rows have three values, as the golden record's have.
+const THREE_GROUPS: [Group; 3] = [Group::Means, Group::LogScales, Group::Sh];
+
+fn in_three_groups(values: &[f32]) -> Columns {
+    let n = values.len() / 3;
+    let data = [values.to_vec(), vec![0.0; 4 * n], values.to_vec(), vec![0.0; n], values.to_vec()];
+    Columns { data, widths: [3, 4, 3, 1, 3] }
 }

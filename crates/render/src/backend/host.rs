@@ -110,7 +110,7 @@ mod flex {
         }
 
         fn f32_into_vec(tensor: FlexTensor) -> Vec<f32> {
-            Self::f32_slice(&tensor).into_owned()
+            tensor.into_data().try_into_vec().expect("splat parameters are f32")
         }
 
         fn f32_tensor(data: Vec<f32>, shape: &[usize]) -> FlexTensor {

@@ -84,7 +84,7 @@ impl PackedLayout {
     /// The buffer that `parameters` are the sections of: their own if they are views of one, else a packed copy.
     ///
     /// # Errors
-    /// [`Error::Limit`] when the copy is larger than the adapter takes.
+    /// [`crate::Error::Limit`] when the copy is larger than the adapter takes.
     pub fn pack(gpu: &Gpu, parameters: Parameters<CubeBackend>) -> Result<(Self, CubeTensor)> {
         let num_rows = parameters.opacity_logits.meta.shape()[0];
         let layout = Self::new(num_rows, parameters.sh.meta.shape()[1]);

@@ -168,7 +168,7 @@ impl Scene {
 
     /// Renders without gradients.
     pub fn frame_on(&self, device: &Device) -> Frame {
-        let splats = Splats::from_cloud(&self.cloud, device);
+        let splats = Splats::from_cloud(&self.cloud, device).expect("it fits");
         let out = render(&splats, &self.camera, &self.options).expect("the scene is legal");
         self.collect(host(out.image), out.stats, out.splat_stats)
     }
@@ -182,7 +182,7 @@ impl Scene {
     pub fn frame_and_gradients_on(&self, device: &Device, upstream: &[f32]) -> (Frame, Gradients) {
         let device = device.clone().autodiff();
         let n = self.cloud.len();
-        let splats = Splats::from_cloud(&self.cloud, &device).require_grad();
+        let splats = Splats::from_cloud(&self.cloud, &device).expect("it fits").require_grad();
         let probe = MeansProbe::new(n, &device);
         let options = RenderOptions { pass: training(self.options.pass), ..self.options };
         let out = render_probed(&splats, &probe, &self.camera, &options).expect("the scene is legal");
@@ -206,7 +206,7 @@ impl Scene {
 
     /// Why the renderer refuses these options, `None` when it does not.
     pub fn refusal(&self, options: &RenderOptions) -> Option<gazesplat_render::Error> {
-        render(&Splats::from_cloud(&self.cloud, &device()), &self.camera, options).err()
+        render(&Splats::from_cloud(&self.cloud, &device()).expect("it fits"), &self.camera, options).err()
     }
 
     fn collect(&self, image: Vec<f32>, stats: RenderStats, splat_stats: SplatStats) -> Frame {

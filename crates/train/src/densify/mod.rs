@@ -1,14 +1,13 @@
 //! How the number and the places of Gaussians change during training: one paper per file.
 
 pub mod mcmc;
-mod noise;
 pub mod relocation;
 
 pub use mcmc::Mcmc;
 
+use crate::error::Result;
 use crate::event::DensifyReport;
-use crate::losses::LossTerm;
-use crate::optim::{Columns, Optimized};
+use crate::optim::{ModelState, Regularizers};
 
 /// Where a run stands, for a strategy.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,12 +20,17 @@ pub struct StepContext {
     pub means_lr: f32,
 }
 
-/// A way to place Gaussians where they are needed.
+/// A way to place Gaussians where they are needed. It acts through the operations of [`ModelState`], so that it works
+/// wherever the model lives.
 pub trait Strategy: Send {
-    /// Adds the gradients of regularisers to `grads`, before the optimiser's update, and reports their values.
-    fn regularize(&mut self, params: &Columns, grads: &mut Columns) -> Vec<LossTerm>;
+    /// Terms it adds to the loss.
+    fn regularizers(&self) -> Regularizers;
+
     /// Called after the optimiser's update. A report means that the step was one at which rows may have changed.
-    fn after_update(&mut self, state: &mut Optimized, context: &StepContext) -> Option<DensifyReport>;
+    ///
+    /// # Errors
+    /// As the operations it uses.
+    fn after_update(&mut self, state: &mut ModelState, context: &StepContext) -> Result<Option<DensifyReport>>;
 }
 
 /// No densification: the initial Gaussians are only optimised.
@@ -34,11 +38,11 @@ pub trait Strategy: Send {
 pub struct Fixed;
 
 impl Strategy for Fixed {
-    fn regularize(&mut self, _params: &Columns, _grads: &mut Columns) -> Vec<LossTerm> {
-        Vec::new()
+    fn regularizers(&self) -> Regularizers {
+        Regularizers::default()
     }
 
-    fn after_update(&mut self, _state: &mut Optimized, _context: &StepContext) -> Option<DensifyReport> {
-        None
+    fn after_update(&mut self, _state: &mut ModelState, _context: &StepContext) -> Result<Option<DensifyReport>> {
+        Ok(None)
     }
 }

@@ -1,5 +1,7 @@
 //! What n Gaussians at the place of one must look like so that the image stays the same (MCMC, Eq. 9).
 
+use std::sync::LazyLock;
+
 /// Largest number of Gaussians one is divided into at once: keeps the alternating sums exact in `f64`.
 pub const MAX_PARTS: usize = 51;
 
@@ -26,6 +28,12 @@ impl Default for RelocationTable {
 }
 
 impl RelocationTable {
+    /// The one table there is.
+    pub fn shared() -> &'static Self {
+        static TABLE: LazyLock<RelocationTable> = LazyLock::new(RelocationTable::default);
+        &TABLE
+    }
+
     /// Opacity of each of `num_parts` Gaussians that replace one of `opacity`, and the factor of their scales.
     ///
     /// The opacity keeps the transmittance through the centre: (1 − o')ⁿ = 1 − o. The scale keeps the integral of the

@@ -2,4 +2,5 @@
 
 pub mod cpu;
 #[cfg(feature = "gpu")]
+#[expect(missing_docs, reason = "what the kernel macros generate carries no documentation")]
 pub mod gpu;

@@ -1,14 +1,17 @@
-//! The optimiser: parameters and moments as rows on the host, Adam over all groups, learning-rate schedules.
+//! The optimiser: a model in training, its parameters as rows on the host, learning-rate schedules.
 
 pub mod adam;
 pub mod schedule;
-pub mod surgery;
+pub mod state;
 
-pub use adam::{Adam, AdamSettings};
+pub use adam::{AdamSettings, Regularizers};
 pub use schedule::LearningRates;
-pub use surgery::Optimized;
+pub use state::ModelState;
 
+use crate::error::Result;
+use crate::host::read;
 use burn::tensor::{Device, Tensor, TensorData};
+use gazesplat_core::GaussianCloud;
 use gazesplat_render::Splats;
 
 /// A parameter tensor of the model.
@@ -52,23 +55,38 @@ pub struct Columns {
 }
 
 impl Columns {
-    /// Takes the values out of `splats` without copying them, if no other tensor shares them.
-    pub fn from_splats(splats: Splats) -> Self {
+    /// The rows of `cloud`.
+    pub fn from_cloud(cloud: &GaussianCloud) -> Self {
+        let data = [
+            cloud.means.as_flattened().to_vec(),
+            cloud.quats.as_flattened().to_vec(),
+            cloud.log_scales.as_flattened().to_vec(),
+            cloud.opacity_logits.clone(),
+            cloud.sh.as_flattened().to_vec(),
+        ];
+        Self { data, widths: [3, 4, 3, 1, 3 * cloud.num_coefficients()] }
+    }
+
+    /// Takes the values out of `splats`; on a CPU without copying them, if no other tensor shares them.
+    ///
+    /// # Errors
+    /// [`crate::Error::Render`] when the device does not answer.
+    pub fn from_splats(splats: Splats) -> Result<Self> {
         let [_, num_coefficients, _] = splats.sh.dims();
         let data = [
-            into_vec(splats.means),
-            into_vec(splats.quats),
-            into_vec(splats.log_scales),
-            into_vec(splats.opacity_logits),
-            into_vec(splats.sh),
+            read(splats.means)?,
+            read(splats.quats)?,
+            read(splats.log_scales)?,
+            read(splats.opacity_logits)?,
+            read(splats.sh)?,
         ];
-        Self { data, widths: [3, 4, 3, 1, 3 * num_coefficients] }
+        Ok(Self { data, widths: [3, 4, 3, 1, 3 * num_coefficients] })
     }
 
     /// Moves the values into tensors on `device`.
     pub fn into_splats(self, device: &Device) -> Splats {
         let n = self.num_rows();
-        let num_coefficients = self.widths[Group::Sh as usize] / 3;
+        let num_coefficients = self.num_coefficients();
         let [means, quats, log_scales, opacity_logits, sh] = self.data;
         Splats {
             means: Tensor::from_data(TensorData::new(means, [n, 3]), device),
@@ -87,6 +105,11 @@ impl Columns {
     /// Number of rows N.
     pub fn num_rows(&self) -> usize {
         self.data[Group::OpacityLogits as usize].len()
+    }
+
+    /// SH coefficients per row and channel.
+    pub fn num_coefficients(&self) -> usize {
+        self.widths[Group::Sh as usize] / 3
     }
 
     /// Values of a group.
@@ -127,11 +150,6 @@ impl Columns {
     }
 }
 
-/// The values of a tensor; free when it is contiguous and not shared.
-pub(crate) fn into_vec<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_into_vec().expect("parameters and gradients are f32")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -149,7 +167,7 @@ mod tests {
         for device in devices {
             let columns = columns();
             let (expected, addresses) = (columns.clone(), columns.data.each_ref().map(|d| d.as_ptr()));
-            let back = Columns::from_splats(columns.into_splats(&device));
+            let back = Columns::from_splats(columns.into_splats(&device)).expect("a CPU answers");
             assert_eq!(back, expected);
             assert_eq!(back.data.each_ref().map(|d| d.as_ptr()), addresses);
         }

@@ -9,7 +9,7 @@
 
 use super::project::{GaussianBuffers, NON_FINITE_DEPTH, Projected};
 use super::scan::exclusive_scan;
-use super::sort::radix_sort;
+use super::sort::{depth_order, radix_sort};
 use crate::error::{Error, Result};
 use crate::gpu::{Gpu, UNITS, cube_dim};
 use crate::kernels::cpu::bin::TileGrid;
@@ -83,7 +83,7 @@ pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid
         counters.clone().into_buffer_arg(),
         n as u32,
     );
-    let (_, global_from_compact) = radix_sort(gpu, keys, ids, n, visible_offsets, n, u32::BITS)?;
+    let global_from_compact = depth_order(gpu, keys, ids, n, visible_offsets, n)?;
     // 2. Pairs of each splat; their records begin where those of the splats before end.
     let num_tiles = gpu.empty("bytes of tile counts", &[n], DType::U32)?;
     count_tiles::launch(

@@ -1,4 +1,4 @@
-//! The passes on a GPU: CubeCL kernels, the mirror of [`super::cpu`] file by file.
+//! The passes on a GPU: CubeCL kernels, the mirror of [`cpu`](super::cpu) file by file.
 //!
 //! Order of a frame: [`project`] → [`sort`] (with [`scan`]) → [`bin`] → [`rasterize`]; backwards [`rasterize_bwd`] →
 //! [`project_bwd`]. No float is ever added atomically: every sum has a fixed order, so one adapter gives the same bits

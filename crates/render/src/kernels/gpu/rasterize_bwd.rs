@@ -1,6 +1,6 @@
 //! Gradient of the rasterisation: every tile walks its list back to front.
 //!
-//! One workgroup per tile, in batches of [`BATCH`] splats and two phases. In the first a unit is a pixel: it steps its
+//! One workgroup per tile, in batches of eight splats and two phases. In the first a unit is a pixel: it steps its
 //! transmittance T in front of each splat, and the scalar R·v of what lies behind (renderer.md §3): nothing is subtracted
 //! from a sum, so no digits are lost where 1 − α is small. It leaves v = ∂L/∂power and the weight T α of every splat of the
 //! batch in workgroup memory. In the second, 32 units per splat reduce these to six moments of v, from which mean, conic
@@ -14,7 +14,7 @@ use super::bin::TileLists;
 use super::rasterize::{Raster, alpha_at};
 use super::tile::{STAGED, TileArgs, pixel, stage, staged_splat, tile_args};
 use crate::error::Result;
-use crate::gpu::{Gpu, UNITS, cube_dim};
+use crate::gpu::{Gpu, SHARED_BYTES, UNITS, cube_dim};
 use crate::kernels::cpu::rasterize::RasterOptions;
 use crate::layout::{TILE, grad_lane, lane};
 use crate::math::alpha::LN_2;
@@ -29,6 +29,10 @@ const UNITS_PER_SPLAT: usize = UNITS as usize / BATCH;
 /// Pixels that one of them looks at: the same column in every other row.
 const PIXELS_PER_UNIT: usize = BATCH;
 const _: () = assert!(UNITS_PER_SPLAT == 2 * TILE, "a unit keeps its column");
+const _: () = assert!(
+    4 * (STAGED * BATCH + (2 * BATCH + 4) * UNITS as usize + 1) <= SHARED_BYTES,
+    "adapters are asked for less workgroup memory than this kernel takes"
+);
 
 /// Guard of 1 − α before it divides.
 const ONE_MINUS_ALPHA_MIN: f32 = 1e-6;

@@ -22,6 +22,23 @@ const PER_UNIT: u32 = 4;
 /// Pairs of one workgroup.
 const PER_CUBE: u32 = UNITS * PER_UNIT;
 
+/// Front-to-back order of the visible splats: their indices `ids` by the bits of their depths, which are positive and so
+/// order like the depths; equal depths keep the order of their indices. Of `capacity` splats the first `count[count_at]` are
+/// there.
+///
+/// # Errors
+/// [`crate::Error::Limit`] when a buffer is larger than the adapter takes.
+pub fn depth_order(
+    gpu: &Gpu,
+    depth_bits: CubeTensor,
+    ids: CubeTensor,
+    capacity: usize,
+    count: &CubeTensor,
+    count_at: usize,
+) -> Result<CubeTensor> {
+    Ok(radix_sort(gpu, depth_bits, ids, capacity, count, count_at, u32::BITS)?.1)
+}
+
 /// The pairs ordered by the low `key_bits` bits of their keys; pairs of equal keys keep their order.
 ///
 /// `keys` and `values` hold `capacity` words, of which the first `count[count_at]` are pairs; what follows those in the

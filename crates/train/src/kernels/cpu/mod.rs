@@ -1,3 +1,8 @@
 //! The kernels of training on the CPU: slices in, slices out.
 
+pub mod adam;
 pub mod l1_ssim;
+pub mod noise;
+pub mod regularize;
+pub mod relocate;
+pub mod rows;

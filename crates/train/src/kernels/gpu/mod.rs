@@ -1,3 +1,8 @@
 //! The kernels of training on a GPU: the mirror of [`super::cpu`] file by file.
 
+pub mod adam;
 pub mod l1_ssim;
+pub mod noise;
+pub mod regularize;
+pub mod relocate;
+pub mod rows;

@@ -1,18 +1,25 @@
 //! Rows of the parameters and of both moments, added, replaced and widened together.
 
-use super::{Adam, Columns, Group};
+use crate::optim::{Columns, Group};
 use gazesplat_render::cluster::morton_order;
 
-/// Parameters with their optimiser: what densification works on.
+/// Parameters with the moments of their optimiser: what densification works on.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Optimized {
+pub struct Rows {
     /// The parameters.
     pub params: Columns,
-    /// Their moments.
-    pub adam: Adam,
+    /// First moments, one per parameter.
+    pub first: Columns,
+    /// Second moments, one per parameter.
+    pub second: Columns,
 }
 
-impl Optimized {
+impl Rows {
+    /// Parameters whose moments are zero.
+    pub fn new(params: Columns) -> Self {
+        Self { first: params.zeros_like(), second: params.zeros_like(), params }
+    }
+
     /// Number of rows N.
     pub fn num_rows(&self) -> usize {
         self.params.num_rows()
@@ -32,17 +39,17 @@ impl Optimized {
                 values.extend_from_within(source * width..(source + 1) * width);
             }
             let len = values.len();
-            self.adam.first.data[g].resize(len, 0.0);
-            self.adam.second.data[g].resize(len, 0.0);
+            self.first.data[g].resize(len, 0.0);
+            self.second.data[g].resize(len, 0.0);
         }
     }
 
-    /// Puts row `order[i]` at place i, in parameters and moments.
+    /// Puts row `order[i]` at place i, in parameters and moments; rows that `order` leaves out are gone.
     ///
     /// # Panics
     /// If `order` names something that is not a row.
     pub fn reorder(&mut self, order: &[u32]) {
-        for columns in [&mut self.params, &mut self.adam.first, &mut self.adam.second] {
+        for columns in [&mut self.params, &mut self.first, &mut self.second] {
             for (data, &width) in columns.data.iter_mut().zip(&columns.widths) {
                 let mut moved = Vec::with_capacity(order.len() * width);
                 for &row in order {
@@ -78,8 +85,8 @@ impl Optimized {
     /// If it is not a row.
     pub fn zero_moments(&mut self, row: usize) {
         for group in Group::ALL {
-            self.adam.first.row_mut(group, row).fill(0.0);
-            self.adam.second.row_mut(group, row).fill(0.0);
+            self.first.row_mut(group, row).fill(0.0);
+            self.second.row_mut(group, row).fill(0.0);
         }
     }
 
@@ -90,7 +97,7 @@ impl Optimized {
     pub fn widen_sh(&mut self, num_coefficients: usize) {
         let g = Group::Sh as usize;
         let (old, new) = (self.params.widths[g], 3 * num_coefficients);
-        for columns in [&mut self.params, &mut self.adam.first, &mut self.adam.second] {
+        for columns in [&mut self.params, &mut self.first, &mut self.second] {
             columns.data[g] = widened(&columns.data[g], old, new);
             columns.widths[g] = new;
         }
@@ -101,7 +108,7 @@ impl Optimized {
 ///
 /// # Panics
 /// If `new` is smaller than `old`.
-pub fn widened(values: &[f32], old: usize, new: usize) -> Vec<f32> {
+fn widened(values: &[f32], old: usize, new: usize) -> Vec<f32> {
     assert!(new >= old, "rows of {old} values cannot be widened to {new}");
     let mut wide = vec![0.0; values.len() / old * new];
     for (to, from) in wide.chunks_exact_mut(new).zip(values.chunks_exact(old)) {
@@ -113,17 +120,16 @@ pub fn widened(values: &[f32], old: usize, new: usize) -> Vec<f32> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::optim::AdamSettings;
 
-    fn three_rows() -> Optimized {
+    fn three_rows() -> Rows {
         let widths = [3, 4, 3, 1, 3];
         let data = widths.map(|w| (0..3 * w).map(|i| (i / w) as f32).collect());
         let params = Columns { data, widths };
-        let mut adam = Adam::new(&params, AdamSettings::default());
-        for columns in [&mut adam.first, &mut adam.second] {
+        let mut rows = Rows::new(params);
+        for columns in [&mut rows.first, &mut rows.second] {
             columns.data.iter_mut().for_each(|d| d.fill(7.0));
         }
-        Optimized { params, adam }
+        rows
     }
 
     #[test]
@@ -133,8 +139,8 @@ mod tests {
         for group in Group::ALL {
             assert!(state.params.row(group, 3).iter().all(|v| *v == 2.0));
             assert!(state.params.row(group, 4).iter().all(|v| *v == 0.0));
-            assert!(state.adam.first.row(group, 3).iter().all(|v| *v == 0.0));
-            assert!(state.adam.second.row(group, 2).iter().all(|v| *v == 7.0));
+            assert!(state.first.row(group, 3).iter().all(|v| *v == 0.0));
+            assert!(state.second.row(group, 2).iter().all(|v| *v == 7.0));
         }
         assert_eq!(state.num_rows(), 5);
     }
@@ -145,8 +151,8 @@ mod tests {
         state.replace(0, 2);
         for group in Group::ALL {
             assert!(state.params.row(group, 0).iter().all(|v| *v == 2.0));
-            assert!([0, 2].iter().all(|&r| state.adam.first.row(group, r).iter().all(|v| *v == 0.0)));
-            assert!(state.adam.second.row(group, 1).iter().all(|v| *v == 7.0));
+            assert!([0, 2].iter().all(|&r| state.first.row(group, r).iter().all(|v| *v == 0.0)));
+            assert!(state.second.row(group, 1).iter().all(|v| *v == 7.0));
         }
     }
 
@@ -157,6 +163,6 @@ mod tests {
         let row = state.params.row(Group::Sh, 2);
         assert_eq!(row[..3], [2.0; 3]);
         assert_eq!(row[3..], [0.0; 9]);
-        assert_eq!(state.adam.first.data[Group::Sh as usize].len(), 36);
+        assert_eq!(state.first.data[Group::Sh as usize].len(), 36);
     }
 }

@@ -1,0 +1,164 @@
+//! The training state as a Burn backend extension: every change of a model is one operation on the device it lives on.
+//!
+//! An operation consumes the state and hands it back, so that a CPU backend can work where the values are: nothing is
+//! copied unless something else shares them. A GPU backend queues kernels and reads nothing back, except where an
+//! operation says so. A loss that is not finite closes the state: until [`Status`] is cleared every operation that
+//! would change a parameter leaves the model as it is. So the host may look at the loss when it likes.
+
+#![expect(deprecated, reason = "burn-ndarray is this project's default CPU backend until its successor replaces it")]
+
+mod cpu;
+#[cfg(feature = "gpu")]
+mod gpu;
+
+use crate::event::DensifyReport;
+use crate::optim::{AdamSettings, LearningRates, Regularizers};
+use burn::backend::{
+    Backend, ExtensionType, backend_extension,
+    tensor::{FloatTensor, IntTensor},
+};
+use gazesplat_render::Result;
+use gazesplat_render::backend::Parameters;
+
+/// A model in training.
+#[derive(Debug, Clone, ExtensionType)]
+pub struct State<B: Backend> {
+    /// The parameters.
+    #[extension_type]
+    pub params: Parameters<B>,
+    /// First moments of Adam, one per parameter. Overwritten in place on a GPU: never handed out.
+    #[extension_type]
+    pub first: Parameters<B>,
+    /// Second moments, as the first.
+    #[extension_type]
+    pub second: Parameters<B>,
+    /// [`Status`], `[4]` words. Overwritten in place on a GPU: never handed out.
+    pub status: IntTensor<B>,
+}
+
+/// A state after an operation.
+#[derive(Debug, Clone, ExtensionType)]
+pub struct Changed<B: Backend> {
+    /// The state; as it was if `outcome` is an error.
+    #[extension_type]
+    pub state: State<B>,
+    /// Rows moved and added, or why nothing was done.
+    pub outcome: Result<DensifyReport>,
+}
+
+/// What the host learns of the state when it reads four words back.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Status {
+    /// The update whose loss was not finite, counted from 1, and that loss. No update was done since.
+    pub failed: Option<(u32, f32)>,
+    /// Mean opacity before the last update that was to report it.
+    pub mean_opacity: f32,
+    /// Mean scale before the last update that was to report it, world units.
+    pub mean_scale: f32,
+}
+
+impl Status {
+    /// Number of words.
+    pub const NUM_WORDS: usize = 4;
+
+    /// From words: number of the failed update or 0, bits of its loss, bits of both means.
+    pub fn from_words(words: [u32; Self::NUM_WORDS]) -> Self {
+        Self {
+            failed: (words[0] > 0).then(|| (words[0], f32::from_bits(words[1]))),
+            mean_opacity: f32::from_bits(words[2]),
+            mean_scale: f32::from_bits(words[3]),
+        }
+    }
+
+    /// The words of [`Status::from_words`].
+    pub fn to_words(self) -> [u32; Self::NUM_WORDS] {
+        let (number, loss) = self.failed.unwrap_or((0, 0.0));
+        [number, loss.to_bits(), self.mean_opacity.to_bits(), self.mean_scale.to_bits()]
+    }
+}
+
+/// One update of Adam.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamUpdate {
+    /// Number of the update, counted from 1.
+    pub number: u32,
+    /// Constants.
+    pub settings: AdamSettings,
+    /// Learning rates.
+    pub rates: LearningRates,
+    /// Regularisers whose gradients are added to those of the loss.
+    pub regularizers: Regularizers,
+    /// Put the means that the regularisers weigh into the status; a CPU does it anyway.
+    pub report: bool,
+}
+
+/// One addition of position noise (MCMC, Eq. 8).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NoiseUpdate {
+    /// Learning rate of the means times the noise multiple, world units; 0 = no noise.
+    pub strength: f32,
+    /// Seed of the run.
+    pub seed: u64,
+    /// Number of the step, counted from 1.
+    pub step: u32,
+}
+
+/// One relocation and growth (MCMC, Sec. 3.4).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Refinement {
+    /// Seed of the run.
+    pub seed: u64,
+    /// Number of the step, counted from 1.
+    pub step: u32,
+    /// Factor of the number of rows.
+    pub growth: f32,
+    /// Largest number of rows.
+    pub cap: usize,
+    /// A row of at most this opacity is dead.
+    pub min_opacity: f32,
+    /// Middle of the scene, world units.
+    pub center: [f32; 3],
+    /// A row with a larger log scale is broken.
+    pub max_log_scale: f32,
+    /// A row farther from the centre along an axis is broken, world units.
+    pub max_distance: f32,
+}
+
+impl Refinement {
+    /// Rows to add to `num_rows`.
+    pub fn num_added(&self, num_rows: usize) -> usize {
+        let grown = (num_rows as f64 * f64::from(self.growth)).round() as usize;
+        grown.min(self.cap).saturating_sub(num_rows)
+    }
+}
+
+/// The operations of training. No default bodies: a backend without a kernel does not compile.
+///
+/// `shared` says that something outside the state may hold its parameters. A CPU backend sees that for itself; on a GPU
+/// all five tensors are views of one allocation, which hides it, so it works on a copy when told.
+#[backend_extension(NdArray, Flex: cfg(feature = "flex"), Cube: cfg(feature = "gpu"))]
+pub trait OptimOps: Backend {
+    /// Closes the state if `loss`, `[1]`, is not finite; else adds the gradients of the regularisers to `gradients` and
+    /// does one update of all parameters. A group whose gradient has no rows is left alone.
+    fn adam(
+        #[extension_type] state: State<Self>,
+        #[extension_type] gradients: Parameters<Self>,
+        loss: FloatTensor<Self>,
+        update: AdamUpdate,
+        shared: bool,
+    ) -> Changed<Self>;
+
+    /// Adds position noise to the means.
+    fn add_noise(#[extension_type] state: State<Self>, noise: NoiseUpdate, shared: bool) -> Changed<Self>;
+
+    /// Moves dead rows onto live ones and adds rows. On a GPU with one read-back of four counts: the report names them,
+    /// and nothing may grow out of a model without live rows.
+    fn refine(#[extension_type] state: State<Self>, refinement: Refinement, shared: bool) -> Changed<Self>;
+
+    /// Orders the rows along a Morton curve, so that neighbours in memory are neighbours in space: by the box around
+    /// the means on a CPU, on a GPU by the cube of `half` world units around `center`, which needs no read-back.
+    fn sort_spatially(#[extension_type] state: State<Self>, center: [f32; 3], half: f32) -> Changed<Self>;
+
+    /// Gives every row `num_coefficients` SH coefficients; new ones are zero, with zero moments.
+    fn widen_sh(#[extension_type] state: State<Self>, num_coefficients: usize) -> Changed<Self>;
+}

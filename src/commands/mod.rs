@@ -3,6 +3,8 @@
 pub mod demo;
 pub mod device;
 pub mod eval;
+pub mod hvsq;
+pub mod hvsq_args;
 pub mod info;
 pub mod render;
 pub mod synth;

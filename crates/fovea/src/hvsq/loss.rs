@@ -4,6 +4,7 @@ use super::op::{HvsqTarget, hvsq};
 use super::{Hvsq, HvsqReference, ImageView};
 use crate::hvs::pooling::Pooling;
 use burn::tensor::Tensor;
+use gazesplat_core::color::from_u8;
 use gazesplat_core::image::ImageF32;
 use gazesplat_core::io::images::TrainingImage;
 use gazesplat_train::losses::{ImageLoss, ImageLossValue, LossTarget};
@@ -72,7 +73,7 @@ impl ReferenceCache {
         entries.num_misses += 1;
         drop(entries);
         let (width, height) = target.size();
-        let data: Vec<f32> = target.rgb().iter().map(|v| f32::from(*v) * (1.0 / 255.0)).collect();
+        let data: Vec<f32> = target.rgb().iter().map(|v| from_u8(*v)).collect();
         let reference = self.hvsq.reference(ImageView { width, height, channels: 3, data: &data })?;
         if matches!(self.hvsq.pooling(), Pooling::Uniform { size_px } if *size_px > 1.0) {
             let mut entries = self.lock();

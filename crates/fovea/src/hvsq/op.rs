@@ -17,6 +17,7 @@ use burn::backend::{
     tensor::FloatTensor,
 };
 use burn::tensor::Tensor;
+use gazesplat_core::color::from_u8;
 use gazesplat_render::backend::host::{HostTensors, shape_of};
 use gazesplat_train::losses::LossTarget;
 use std::borrow::Cow;
@@ -225,7 +226,7 @@ fn unmasked<'a>(values: &'a [f32], shape: &[usize], target: &HvsqTarget) -> Cow<
     let pixels = values.chunks_exact_mut(shape[2]).zip(photo.rgb().chunks_exact(3)).zip(mask);
     for ((pixel, color), _) in pixels.filter(|(_, m)| **m == 0) {
         for (v, c) in pixel.iter_mut().zip(color) {
-            *v = f32::from(*c) * (1.0 / 255.0);
+            *v = from_u8(*c);
         }
     }
     Cow::Owned(values)

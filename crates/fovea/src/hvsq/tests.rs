@@ -4,6 +4,7 @@ use super::op::{HvsqTarget, hvsq};
 use super::*;
 use crate::hvs::pooling::GazePooling;
 use burn::tensor::{Device, Tensor, TensorData};
+use gazesplat_core::color::from_u8;
 use gazesplat_core::image::{ImageF32, RgbImage8};
 use gazesplat_core::io::images::TrainingImage;
 use gazesplat_testkit::Rng;
@@ -29,7 +30,7 @@ fn photo(seed: u64, mask: Option<Vec<u8>>) -> LossTarget {
 }
 
 fn colors(target: &LossTarget) -> Vec<f32> {
-    target.rgb().iter().map(|v| f32::from(*v) * (1.0 / 255.0)).collect()
+    target.rgb().iter().map(|v| from_u8(*v)).collect()
 }
 
 fn noise(seed: u64, channels: usize) -> Vec<f32> {

@@ -162,13 +162,15 @@ impl<T: Real> Context<'_, T> {
         }
     }
 
-    /// Restricts gradients of row `y` to the region they are of.
+    /// Restricts gradients of row `y`, `N` per pixel, to the region they are of.
     #[inline(always)]
-    fn restrict(&self, y: usize, v: &mut [T]) {
+    fn restrict<const N: usize>(&self, y: usize, v: &mut [[T; N]]) {
         let width = v.len();
         if let [weights] = self.weights {
             for (v, w) in v.iter_mut().zip(&weights[y * width..][..width]) {
-                *v *= *w;
+                for v in v {
+                    *v *= *w;
+                }
             }
         }
     }
@@ -495,7 +497,7 @@ impl<T: Real> Sweep<'_, T> {
             }
             context.add(&mut tally, y, y, &distances);
             if context.gradient {
-                context.restrict(y, &mut v_row);
+                context.restrict(y, v_row.as_chunks_mut::<1>().0);
                 v_low[y * width..][..width].copy_from_slice(&v_row);
             }
         }

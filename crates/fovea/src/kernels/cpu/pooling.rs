@@ -4,7 +4,7 @@
 //! Tables are computed once per pair of lengths; positions in integers or `f64`. Cells may overlap by one sample where
 //! they shrink, and share samples where they enlarge. Lengths are at least 1.
 
-use crate::real::Real;
+use crate::real::{Real, fma};
 use std::ops::Range;
 
 /// Area mean of `n` samples in `m` cells: cell i covers samples ⌊i n / m⌋ up to ⌈(i + 1) n / m⌉, excluded.
@@ -58,25 +58,28 @@ impl<T: Real> AreaMean<T> {
         self.samples[s].0 as usize..self.samples[s].1 as usize
     }
 
-    /// Means of a row, times `scale`.
+    /// Means of two rows, times `scale`, one beside the other.
     #[inline(always)]
-    pub fn means(&self, row: &[T], scale: T, out: &mut [T]) {
+    pub fn means(&self, rows: [&[T]; 2], scale: T, out: &mut [[T; 2]]) {
         for ((v, (a, b)), inverse) in out.iter_mut().zip(&self.cells).zip(&self.inverse_counts) {
-            let mut sum = T::ZERO;
-            for x in &row[*a as usize..*b as usize] {
+            let (mut sum, mut other) = (T::ZERO, T::ZERO);
+            let range = *a as usize..*b as usize;
+            for (x, y) in rows[0][range.clone()].iter().zip(&rows[1][range]) {
                 sum += *x;
+                other += *y;
             }
-            *v = sum * (*inverse * scale);
+            let scale = *inverse * scale;
+            *v = [sum * scale, other * scale];
         }
     }
 
     /// For every sample the sum over its cells: the adjoint of [`AreaMean::means`] but for the counts.
     #[inline(always)]
-    pub fn spread(&self, cells: &[T], out: &mut [T]) {
+    pub fn spread(&self, cells: &[[T; 2]], out: &mut [[T; 2]]) {
         for (v, (a, b)) in out.iter_mut().zip(&self.samples) {
             let mut sum = cells[*a as usize];
             for x in &cells[*a as usize + 1..*b as usize] {
-                sum += *x;
+                sum = [sum[0] + x[0], sum[1] + x[1]];
             }
             *v = sum;
         }
@@ -92,8 +95,8 @@ pub(crate) struct Bilinear<T> {
     first: Vec<u32>,
     /// Weight of the second value.
     weight: Vec<T>,
-    /// Places that every value contributes to.
-    targets: Vec<(u32, u32)>,
+    /// First place whose first value is not below this one, for every value and one more.
+    starts: Vec<u32>,
 }
 
 impl<T: Real> Bilinear<T> {
@@ -106,13 +109,8 @@ impl<T: Real> Bilinear<T> {
             first.push(i as u32);
             weight.push(if i == m - 1 { T::ZERO } else { T::of(c - i as f64) });
         }
-        let targets = (0..m as u32)
-            .map(|j| {
-                let start = first.partition_point(|i| i + 1 < j);
-                (start as u32, first.partition_point(|i| *i <= j) as u32)
-            })
-            .collect();
-        Self { num_values: m, first, weight, targets }
+        let starts = (0..=m as u32).map(|j| first.partition_point(|i| *i < j) as u32).collect();
+        Self { num_values: m, first, weight, starts }
     }
 
     /// First value of place `s`.
@@ -129,19 +127,16 @@ impl<T: Real> Bilinear<T> {
     }
 
     /// Places whose first value is in `values`.
+    #[inline(always)]
     pub fn places(&self, values: Range<usize>) -> Range<usize> {
-        let below = |i: usize| self.first.partition_point(|f| (*f as usize) < i);
-        below(values.start)..below(values.end)
+        self.starts[values.start] as usize..self.starts[values.end] as usize
     }
 
     /// Places that value `j` contributes to, with its weight there.
     #[inline(always)]
     pub fn targets(&self, j: usize) -> impl Iterator<Item = (usize, T)> {
-        let (start, end) = self.targets[j];
-        (start as usize..end as usize).map(move |s| {
-            let weight = self.weight[s];
-            (s, if self.first(s) == j { T::ONE - weight } else { weight })
-        })
+        let second = self.places(j.saturating_sub(1)..j).map(|s| (s, self.weight[s]));
+        second.chain(self.places(j..j + 1).map(|s| (s, T::ONE - self.weight[s])))
     }
 
     /// All places of a row of values.
@@ -155,12 +150,47 @@ impl<T: Real> Bilinear<T> {
         }
     }
 
+    /// All places of two rows of pairs, one beside the other: the four numbers share what is looked up.
+    #[inline(always)]
+    pub fn enlarge_pairs<const FMA: bool>(&self, values: [&[[T; 2]]; 2], out: &mut [[T; 4]]) {
+        let last = self.num_values - 1;
+        for ((v, i), w) in out.iter_mut().zip(&self.first).zip(&self.weight) {
+            let i = *i as usize;
+            let next = (i + 1).min(last);
+            let [[a0, a1], [b0, b1]] = [values[0][i], values[0][next]];
+            let [[c0, c1], [d0, d1]] = [values[1][i], values[1][next]];
+            let (from, to) = ([a0, a1, c0, c1], [b0, b1, d0, d1]);
+            for q in 0..4 {
+                v[q] = fma::<T, FMA>(*w, to[q] - from[q], from[q]);
+            }
+        }
+    }
+
     /// Value `j` of the adjoint of [`Bilinear::enlarge`].
     #[inline(always)]
     pub fn gathered(&self, j: usize, v_places: &[T]) -> T {
         let mut sum = T::ZERO;
         for (s, weight) in self.targets(j) {
             sum += weight * v_places[s];
+        }
+        sum
+    }
+
+    /// Value `j` of the adjoint of [`Bilinear::enlarge`] for pairs.
+    #[inline(always)]
+    pub fn gathered_pair<const FMA: bool>(&self, j: usize, v_places: &[[T; 2]]) -> [T; 2] {
+        let mut sum = [T::ZERO; 2];
+        let mut add = |weight: T, v: &[T; 2]| {
+            sum[0] = fma::<T, FMA>(weight, v[0], sum[0]);
+            sum[1] = fma::<T, FMA>(weight, v[1], sum[1]);
+        };
+        let places = self.places(j.saturating_sub(1)..j);
+        for (w, v) in self.weight[places.clone()].iter().zip(&v_places[places]) {
+            add(*w, v);
+        }
+        let places = self.places(j..j + 1);
+        for (w, v) in self.weight[places.clone()].iter().zip(&v_places[places]) {
+            add(T::ONE - *w, v);
         }
         sum
     }
@@ -236,17 +266,32 @@ mod tests {
                 }
                 let (samples, cells) = (noise(&mut rng, n), noise(&mut rng, m));
                 let area = AreaMean::<f64>::new(n, m);
-                let (mut means, mut spread) = (vec![0.0; m], vec![0.0; n]);
-                area.means(&samples, 1.0, &mut means);
-                let divided: Vec<f64> = (0..m).map(|i| cells[i] * area.inverse_count(i)).collect();
+                let others: Vec<f64> = samples.iter().rev().copied().collect();
+                let (mut means, mut spread) = (vec![[0.0; 2]; m], vec![[0.0; 2]; n]);
+                area.means([&samples, &others], 1.0, &mut means);
+                let divided: Vec<[f64; 2]> =
+                    (0..m).map(|i| [cells[i], 3.0 * cells[i]].map(|v| v * area.inverse_count(i))).collect();
                 area.spread(&divided, &mut spread);
-                let (a, b) = (dot(&means, &cells), dot(&samples, &spread));
-                assert!((a - b).abs() < 1e-12, "area {n} {m}: {a} {b}");
+                for q in 0..2 {
+                    let lane = |pairs: &[[f64; 2]]| pairs.iter().map(|v| v[q]).collect::<Vec<_>>();
+                    let (factor, x) = if q == 0 { (1.0, &samples) } else { (3.0, &others) };
+                    let (a, b) = (factor * dot(&lane(&means), &cells), dot(x, &lane(&spread)));
+                    assert!((a - b).abs() < 1e-11, "area {n} {m}: {a} {b}");
+                }
 
                 let up = Bilinear::<f64>::new(n, m);
                 let mut enlarged = vec![0.0; n];
                 up.enlarge(&cells, &mut enlarged);
                 let gathered: Vec<f64> = (0..m).map(|j| up.gathered(j, &samples)).collect();
+                let pairs: Vec<[f64; 2]> = samples.iter().map(|v| [*v, -v]).collect();
+                for (j, v) in gathered.iter().enumerate() {
+                    let pair = up.gathered_pair::<false>(j, &pairs);
+                    assert!((pair[0] - v).abs() < 1e-12 && pair[1] == -pair[0]);
+                }
+                let cell_pairs: Vec<[f64; 2]> = cells.iter().map(|v| [*v, 2.0 * v]).collect();
+                let mut quads = vec![[0.0; 4]; n];
+                up.enlarge_pairs::<false>([&cell_pairs, &cell_pairs], &mut quads);
+                assert!(quads.iter().zip(&enlarged).all(|(q, v)| *q == [*v, 2.0 * v, *v, 2.0 * v]));
                 let (a, b) = (dot(&enlarged, &samples), dot(&cells, &gathered));
                 assert!((a - b).abs() < 1e-12, "bilinear {n} {m}: {a} {b}");
             }
@@ -260,9 +305,9 @@ mod tests {
             let axis = Axis::<f64>::new(n, m);
             assert!(axis.is_identity());
             let samples = noise(&mut rng, n);
-            let (mut cells, mut back) = (vec![0.0; m], vec![0.0; n]);
-            axis.area.means(&samples, 1.0, &mut cells);
-            axis.up.enlarge(&cells, &mut back);
+            let (mut cells, mut back) = (vec![[0.0; 2]; m], vec![0.0; n]);
+            axis.area.means([&samples, &samples], 1.0, &mut cells);
+            axis.up.enlarge(&cells.iter().map(|v| v[0]).collect::<Vec<_>>(), &mut back);
             assert_eq!(back, samples);
         }
         assert!(!Axis::<f64>::new(6, 4).is_identity() && !Axis::<f64>::new(4, 6).is_identity());

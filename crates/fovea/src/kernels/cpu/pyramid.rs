@@ -122,12 +122,13 @@ impl<T: Real> Filters<T> {
     }
 }
 
-/// Runs `$block::<$size>(x0)` for blocks that cover `$n` columns.
+/// Runs the body for blocks of `$size` columns from `$x0` on that cover `$n`; a filter reaches `$reach` columns of each.
 macro_rules! in_blocks {
-    ($n:expr, |$x0:ident, $size:ident| $body:expr) => {{
+    ($n:expr, |$x0:ident, $size:ident, $reach:ident| $body:expr) => {{
         let n = $n;
         if n >= $crate::kernels::cpu::pyramid::BLOCK {
             const $size: usize = $crate::kernels::cpu::pyramid::BLOCK;
+            const $reach: usize = $size + 4;
             let mut next = 0;
             while next < n {
                 let $x0 = next.min(n - $crate::kernels::cpu::pyramid::BLOCK);
@@ -136,6 +137,7 @@ macro_rules! in_blocks {
             }
         } else {
             const $size: usize = $crate::kernels::cpu::pyramid::SMALL_BLOCK;
+            const $reach: usize = $size + 4;
             debug_assert_eq!(n % $crate::kernels::cpu::pyramid::SMALL_BLOCK, 0);
             let mut $x0 = 0;
             while $x0 < n {
@@ -164,11 +166,11 @@ pub(crate) fn correlate_row<T: Real, const FMA: bool, const N: usize>(
     let kernels: &[Kernel<T>; N] = kernels.try_into().expect("as many filters as asked for");
     let rows = plane.rows_around(y);
     let width = plane.width;
-    in_blocks!(width, |x0, B| {
+    in_blocks!(width, |x0, B, C| {
         let sums = if antisymmetric {
-            correlate_antisymmetric::<T, FMA, N, B>(&rows, x0, kernels)
+            correlate_antisymmetric::<T, FMA, N, B, C>(&rows, x0, kernels)
         } else {
-            correlate_any::<T, FMA, N, B>(&rows, x0, kernels)
+            correlate_any::<T, FMA, N, B, C>(&rows, x0, kernels)
         };
         for (o, sums) in sums.iter().enumerate() {
             out[o * width + x0..][..B].copy_from_slice(sums);
@@ -177,41 +179,42 @@ pub(crate) fn correlate_row<T: Real, const FMA: bool, const N: usize>(
 }
 
 #[inline(always)]
-fn correlate_any<T: Real, const FMA: bool, const N: usize, const B: usize>(
+fn correlate_any<T: Real, const FMA: bool, const N: usize, const B: usize, const C: usize>(
     rows: &[&[T]; 5],
     x0: usize,
     kernels: &[Kernel<T>; N],
 ) -> [[T; B]; N] {
     let mut sums = [[T::ZERO; B]; N];
     for (o, sums) in sums.iter_mut().enumerate() {
-        *sums = weighted::<T, FMA, B>(rows, x0, &kernels[o], *sums);
+        *sums = weighted::<T, FMA, B, C>(rows, x0, &kernels[o], *sums);
     }
     sums
 }
 
-/// What tap i of a filter meets.
+/// The rows that a block of columns reaches: tap (i, j) of column x meets value x + j of row i. Arrays, so that five
+/// addresses serve 25 taps.
 #[inline(always)]
-fn neighbours<'a, T, const B: usize>(rows: &[&'a [T]; 5], x0: usize) -> [&'a [T; B]; 25] {
-    let mut at = [block::<T, B>(rows[0], x0); 25];
-    for (i, at) in at.iter_mut().enumerate() {
-        *at = block(rows[i / 5], x0 + i % 5);
+fn reached<'a, T, const C: usize>(rows: &[&'a [T]; 5], x0: usize) -> [&'a [T; C]; 5] {
+    let mut at = [block::<T, C>(rows[0], x0); 5];
+    for (at, row) in at.iter_mut().zip(rows) {
+        *at = block::<T, C>(row, x0);
     }
     at
 }
 
 /// `sums` plus the 25 taps times the block's neighbourhood: tap (i, j) meets column x0 + x + j of row i.
 #[inline(always)]
-fn weighted<T: Real, const FMA: bool, const B: usize>(
+fn weighted<T: Real, const FMA: bool, const B: usize, const C: usize>(
     rows: &[&[T]; 5],
     x0: usize,
     k: &Kernel<T>,
     mut sums: [T; B],
 ) -> [T; B] {
-    let at = neighbours::<T, B>(rows, x0);
+    let at = reached::<T, C>(rows, x0);
     for x in 0..B {
         let mut sum = sums[x];
         macro_rules! taps {
-            ($($i:literal)*) => { $(sum = fma::<T, FMA>(k[$i], at[$i][x], sum);)* };
+            ($($i:literal)*) => { $(sum = fma::<T, FMA>(k[$i], at[$i / 5][x + $i % 5], sum);)* };
         }
         taps!(0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20 21 22 23 24);
         sums[x] = sum;
@@ -221,18 +224,18 @@ fn weighted<T: Real, const FMA: bool, const B: usize>(
 
 /// Opposite taps differ in sign, so all filters share the twelve differences of opposite pixels.
 #[inline(always)]
-fn correlate_antisymmetric<T: Real, const FMA: bool, const N: usize, const B: usize>(
+fn correlate_antisymmetric<T: Real, const FMA: bool, const N: usize, const B: usize, const C: usize>(
     rows: &[&[T]; 5],
     x0: usize,
     kernels: &[Kernel<T>; N],
 ) -> [[T; B]; N] {
     let mut sums = [[T::ZERO; B]; N];
-    let at = neighbours::<T, B>(rows, x0);
+    let at = reached::<T, C>(rows, x0);
     for x in 0..B {
         let mut sum = [T::ZERO; N];
         macro_rules! pairs {
             ($($i:literal)*) => { $(
-                let difference = at[$i][x] - at[24 - $i][x];
+                let difference = at[$i / 5][x + $i % 5] - at[(24 - $i) / 5][x + (24 - $i) % 5];
                 for o in 0..N {
                     sum[o] = fma::<T, FMA>(kernels[o][$i], difference, sum[o]);
                 }
@@ -259,14 +262,14 @@ pub(crate) const GRADIENT_PAD: usize = 2 * RADIUS;
 
 /// Adds to `v_row` the gradient by row `y` of a plane of `height` rows, given the gradients by the outputs of `N` filters, [`flipped`]:
 /// `v_out(o, r)` is row r, 0 ≤ r < height, |r − y| ≤ 2, of filter o with [`GRADIENT_PAD`] zeros on each side. `zeros` is
-/// such a row of zeros; `reached` is scratch of the plane's width + 4.
+/// such a row of zeros; `sums_row` is scratch of the plane's width + 4.
 #[inline(always)]
 pub(crate) fn correlate_row_bwd<'a, T: Real, const FMA: bool, const N: usize>(
     v_out: impl Fn(usize, usize) -> &'a [T],
     zeros: &'a [T],
     (y, height): (usize, usize),
     flipped: &[Kernel<T>; N],
-    reached: &mut [T],
+    sums_row: &mut [T],
     v_row: &mut [T],
 ) {
     // Correlation with the flipped filter, over the row and the two reflected columns on each side.
@@ -286,18 +289,18 @@ pub(crate) fn correlate_row_bwd<'a, T: Real, const FMA: bool, const N: usize>(
                 }
             }
         }
-        in_blocks!(width + 2 * RADIUS, |x0, B| {
+        in_blocks!(width + 2 * RADIUS, |x0, B, C| {
             let mut sums = [T::ZERO; B];
             for o in 0..N {
-                sums = weighted::<T, FMA, B>(&rows[o], x0, &flipped[o], sums);
+                sums = weighted::<T, FMA, B, C>(&rows[o], x0, &flipped[o], sums);
             }
-            reached[x0..x0 + B].copy_from_slice(&sums);
+            sums_row[x0..x0 + B].copy_from_slice(&sums);
         });
-        for (v, r) in v_row.iter_mut().zip(&reached[RADIUS..]) {
+        for (v, r) in v_row.iter_mut().zip(&sums_row[RADIUS..]) {
             *v += *r;
         }
         for i in [-2isize, -1, width as isize, width as isize + 1] {
-            v_row[reflect(i, width)] += reached[(i + RADIUS as isize) as usize];
+            v_row[reflect(i, width)] += sums_row[(i + RADIUS as isize) as usize];
         }
     }
 }

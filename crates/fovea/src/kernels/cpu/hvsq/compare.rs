@@ -10,7 +10,7 @@ use crate::real::{Real, Task, add_scaled, dispatch, fma};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Compares `[rows of cells, num_maps, 2, columns of cells]` of two images. The gradient, of the same shape, is by the
+/// Compares `[rows of cells, num_maps, columns of cells, 2]` of two images. The gradient, of the same shape, is by the
 /// sums over the samples of a cell (divided by their number already); empty when not wanted.
 pub(super) fn grids<T: Real>(
     found: &[T],
@@ -68,64 +68,50 @@ impl<T: Real> Compare<'_, T> {
         let reached = if context.gradient { up.places(rows.start.saturating_sub(1)..rows.end) } else { own.clone() };
         let mut tally = context.tally(own.len(), width);
         // Enlarged rows of cells i at i mod 2: mean and mean square of the first image, then of the second.
-        let mut enlarged = vec![T::ZERO; 2 * 4 * width];
-        let mut v_rows = vec![T::ZERO; 2 * 2 * width];
+        let mut enlarged = vec![[T::ZERO; 4]; 2 * width];
+        let mut v_rows = vec![[T::ZERO; 2]; 2 * width];
         let mut distances = vec![T::ZERO; width];
-        let mut v_pixels = vec![T::ZERO; 2 * width];
+        let mut v_pixels = vec![[T::ZERO; 2]; width];
         for o in 0..num_maps {
             let mut enlarged_of = [usize::MAX; 2];
             let mut v_rows_of = [usize::MAX; 2];
-            v_rows.fill(T::ZERO);
+            v_rows.fill([T::ZERO; 2]);
             for y in reached.clone() {
                 let (upper, lower, weight) = up.source(y);
                 for i in [upper, lower] {
                     if enlarged_of[i % 2] != i {
                         enlarged_of[i % 2] = i;
-                        let cells = |grids: &'_ [T], q: usize| {
-                            let start = ((i * num_maps + o) * 2 + q) * columns;
-                            start..(start + columns).min(grids.len())
-                        };
-                        let slot = &mut enlarged[i % 2 * 4 * width..][..4 * width];
-                        for (q, out) in slot.chunks_exact_mut(width).enumerate() {
-                            let grids = if q < 2 { found } else { reference };
-                            pools.x.up.enlarge(&grids[cells(grids, q % 2)], out);
-                        }
+                        let start = (i * num_maps + o) * 2 * columns;
+                        let found = found[start..][..2 * columns].as_chunks().0;
+                        let reference = reference[start..][..2 * columns].as_chunks().0;
+                        let out = &mut enlarged[i % 2 * width..][..width];
+                        pools.x.up.enlarge_pairs::<FMA>([found, reference], out);
                     }
                 }
-                let upper_rows = &enlarged[upper % 2 * 4 * width..][..4 * width];
-                let lower_rows = &enlarged[lower % 2 * 4 * width..][..4 * width];
-                compare_row::<T, FMA, L1>(
-                    [upper_rows, lower_rows],
-                    weight,
-                    context.scale,
-                    width,
-                    &mut distances,
-                    &mut v_pixels,
-                );
+                let rows_of = [&enlarged[upper % 2 * width..][..width], &enlarged[lower % 2 * width..][..width]];
+                compare_row::<T, FMA, L1>(rows_of, weight, context.scale, &mut distances, &mut v_pixels);
                 if own.contains(&y) {
                     context.add(&mut tally, y, y - own.start, &distances);
                 }
                 if !context.gradient {
                     continue;
                 }
-                for v in v_pixels.chunks_exact_mut(width) {
-                    context.restrict(y, v);
-                }
+                context.restrict(y, &mut v_pixels);
                 for (i, w) in [(upper, T::ONE - weight), (lower, weight)] {
                     if w == T::ZERO || !rows.contains(&i) {
                         continue;
                     }
-                    let slot = &mut v_rows[i % 2 * 2 * width..][..2 * width];
+                    let slot = &mut v_rows[i % 2 * width..][..width];
                     if v_rows_of[i % 2] != i {
-                        finish(pools, v_rows_of[i % 2], (rows.start, num_maps, o), slot, v_grids);
+                        finish::<T, FMA>(pools, v_rows_of[i % 2], (rows.start, num_maps, o), slot, v_grids);
                         v_rows_of[i % 2] = i;
                     }
-                    add_scaled::<T, FMA>(slot, w, &v_pixels);
+                    add_scaled::<T, FMA>(slot.as_flattened_mut(), w, v_pixels.as_flattened());
                 }
             }
             if context.gradient {
-                for (i, slot) in v_rows_of.into_iter().zip(v_rows.chunks_exact_mut(2 * width)) {
-                    finish(pools, i, (rows.start, num_maps, o), slot, v_grids);
+                for (i, slot) in v_rows_of.into_iter().zip(v_rows.chunks_exact_mut(width)) {
+                    finish::<T, FMA>(pools, i, (rows.start, num_maps, o), slot, v_grids);
                 }
             }
         }
@@ -135,60 +121,53 @@ impl<T: Real> Compare<'_, T> {
 
 /// Writes the gradients by row `i` of cells from those by its enlarged row, which are cleared; nothing for `usize::MAX`.
 #[inline(always)]
-fn finish<T: Real>(
+fn finish<T: Real, const FMA: bool>(
     pools: &Pools<T>,
     i: usize,
     (first, num_maps, o): (usize, usize, usize),
-    v_row: &mut [T],
+    v_row: &mut [[T; 2]],
     v_grids: &mut [T],
 ) {
     if i != usize::MAX {
         let columns = pools.x.area.num_cells();
-        let width = v_row.len() / 2;
         let out = &mut v_grids[((i - first) * num_maps + o) * 2 * columns..][..2 * columns];
         let by_row = pools.y.area.inverse_count(i);
-        for (out, v) in out.chunks_exact_mut(columns).zip(v_row.chunks_exact(width)) {
-            for (j, out) in out.iter_mut().enumerate() {
-                *out = pools.x.up.gathered(j, v) * (by_row * pools.x.area.inverse_count(j));
-            }
+        for (j, out) in out.as_chunks_mut::<2>().0.iter_mut().enumerate() {
+            let count = by_row * pools.x.area.inverse_count(j);
+            let [mean, square] = pools.x.up.gathered_pair::<FMA>(j, v_row);
+            *out = [mean * count, square * count];
         }
     }
-    v_row.fill(T::ZERO);
+    v_row.fill([T::ZERO; 2]);
 }
 
-/// Distances of one row and, in `v_pixels` (`[2, width]`), the gradients by the enlarged mean and mean square of the
-/// first image.
+/// Distances of one row and, in `v_pixels`, the gradients by the enlarged mean and mean square of the first image.
 #[inline(always)]
 fn compare_row<T: Real, const FMA: bool, const L1: bool>(
-    rows: [&[T]; 2],
+    rows: [&[[T; 4]]; 2],
     weight: T,
     scale: T,
-    width: usize,
     distances: &mut [T],
-    v_pixels: &mut [T],
+    v_pixels: &mut [[T; 2]],
 ) {
-    let (v_means, v_squares) = v_pixels.split_at_mut(width);
-    in_blocks!(width, |x0, B| {
-        let mut at = [[block::<T, B>(rows[0], x0); 4]; 2];
-        for (at, row) in at.iter_mut().zip(rows) {
-            for (q, at) in at.iter_mut().enumerate() {
-                *at = block::<T, B>(&row[q * width..][..width], x0);
-            }
-        }
-        let (mut d, mut v_mean, mut v_square) = ([T::ZERO; B], [T::ZERO; B], [T::ZERO; B]);
+    in_blocks!(distances.len(), |x0, B, _C| {
+        let (upper, lower) = (block::<[T; 4], B>(rows[0], x0), block::<[T; 4], B>(rows[1], x0));
+        let (mut d, mut v) = ([T::ZERO; B], [[T::ZERO; 2]; B]);
         for x in 0..B {
+            let (a, b) = (&upper[x], &lower[x]);
             macro_rules! mixed {
                 ($q:literal) => {
-                    fma::<T, FMA>(weight, at[1][$q][x] - at[0][$q][x], at[0][$q][x])
+                    fma::<T, FMA>(weight, b[$q] - a[$q], a[$q])
                 };
             }
             let found = (mixed!(0), mixed!(1));
             let reference = (mixed!(2), mixed!(3));
-            (d[x], v_mean[x], v_square[x]) = compare_statistics::<T, L1>(found, reference, scale);
+            let (distance, v_mean, v_square) = compare_statistics::<T, L1>(found, reference, scale);
+            d[x] = distance;
+            v[x] = [v_mean, v_square];
         }
         distances[x0..x0 + B].copy_from_slice(&d);
-        v_means[x0..x0 + B].copy_from_slice(&v_mean);
-        v_squares[x0..x0 + B].copy_from_slice(&v_square);
+        v_pixels[x0..x0 + B].copy_from_slice(&v);
     });
 }
 

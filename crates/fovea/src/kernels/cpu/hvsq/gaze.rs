@@ -212,7 +212,7 @@ impl<T: Real> Compare<'_, T> {
         let width = level.width;
         let mut tally = context.tally(y1 - y0, width);
         let mut distances = vec![T::ZERO; width];
-        let mut v_rows = vec![T::ZERO; 2 * width];
+        let mut v_row = vec![[T::ZERO; 2]; width];
         for y in y0..y1 {
             for x in 0..width {
                 let pixel = y * width + x;
@@ -226,19 +226,13 @@ impl<T: Real> Compare<'_, T> {
                     }
                 }
                 let [mean, square, other_mean, other_square] = pooled;
-                (distances[x], v_rows[x], v_rows[width + x]) =
+                (distances[x], v_row[x][0], v_row[x][1]) =
                     compare_statistics::<T, L1>((mean, square), (other_mean, other_square), context.scale);
             }
             context.add(&mut tally, y, y - y0, &distances);
             if context.gradient {
-                for v in v_rows.chunks_exact_mut(width) {
-                    context.restrict(y, v);
-                }
-                let (v_means, v_squares) = v_rows.split_at(width);
-                let out = v_pixels[(y - y0) * width..][..width].iter_mut();
-                for ((out, m), q) in out.zip(v_means).zip(v_squares) {
-                    *out = [*m, *q];
-                }
+                context.restrict(y, &mut v_row);
+                v_pixels[(y - y0) * width..][..width].copy_from_slice(&v_row);
             }
         }
         tally

@@ -101,7 +101,7 @@ fn band<T: Real, const FMA: bool, const N: usize>(band: Band<'_, T>) -> Tally<T>
                         if (y0..y1).contains(&r) {
                             context.add(&mut tally, r, r - y0, &distances);
                         }
-                        context.restrict(r, v);
+                        context.restrict(r, v.as_chunks_mut::<1>().0);
                     }
                 }
             }
@@ -148,8 +148,8 @@ fn compare_responses<T: Real, const L1: bool>(
 struct SpreadRows<T> {
     width: usize,
     of: Vec<[usize; 2]>,
-    rows: Vec<T>,
-    sums: Vec<T>,
+    rows: Vec<[T; 2]>,
+    sums: Vec<[T; 2]>,
 }
 
 impl<T: Real> SpreadRows<T> {
@@ -160,8 +160,8 @@ impl<T: Real> SpreadRows<T> {
         Self {
             width,
             of: vec![[usize::MAX; 2]; num_maps],
-            rows: vec![T::ZERO; num_maps * 2 * 2 * width],
-            sums: vec![T::ZERO; 2 * pools.x.area.num_cells()],
+            rows: vec![[T::ZERO; 2]; num_maps * 2 * width],
+            sums: vec![[T::ZERO; 2]; pools.x.area.num_cells()],
         }
     }
 
@@ -178,44 +178,35 @@ impl<T: Real> SpreadRows<T> {
     ) {
         let (width, num_maps, columns) = (self.width, self.of.len(), pools.x.area.num_cells());
         let cells = pools.y.area.cells_of(r);
-        let of_cell = |i: usize| &v_grids[(i * num_maps + o) * 2 * columns..][..2 * columns];
-        let slots = &mut self.rows[o * 4 * width..][..4 * width];
+        let of_cell = |i: usize| v_grids[(i * num_maps + o) * 2 * columns..][..2 * columns].as_chunks().0;
+        let slots = &mut self.rows[o * 2 * width..][..2 * width];
         let num_slots = if cells.len() <= 2 {
             for i in cells.clone() {
                 if self.of[o][i % 2] != i {
                     self.of[o][i % 2] = i;
-                    let (v_means, v_squares) = of_cell(i).split_at(columns);
-                    let (means, squares) = slots[i % 2 * 2 * width..][..2 * width].split_at_mut(width);
-                    pools.x.area.spread(v_means, means);
-                    pools.x.area.spread(v_squares, squares);
+                    pools.x.area.spread(of_cell(i), &mut slots[i % 2 * width..][..width]);
                 }
             }
             cells.len()
         } else {
-            self.sums.fill(T::ZERO);
+            self.sums.fill([T::ZERO; 2]);
             for i in cells.clone() {
-                for (sum, v) in self.sums.iter_mut().zip(of_cell(i)) {
+                for (sum, v) in self.sums.as_flattened_mut().iter_mut().zip(of_cell(i).as_flattened()) {
                     *sum += *v;
                 }
             }
-            let (v_means, v_squares) = self.sums.split_at(columns);
-            let (means, squares) = slots[cells.start % 2 * 2 * width..][..2 * width].split_at_mut(width);
-            pools.x.area.spread(v_means, means);
-            pools.x.area.spread(v_squares, squares);
+            pools.x.area.spread(&self.sums, &mut slots[cells.start % 2 * width..][..width]);
             self.of[o][cells.start % 2] = usize::MAX;
             1
         };
-        let (even, odd) = slots.split_at(2 * width);
+        let (even, odd) = slots.split_at(width);
         let (one, two) = if cells.start % 2 == 0 { (even, odd) } else { (odd, even) };
-        let (means, squares) = one.split_at(width);
         if num_slots == 1 {
-            for (((v, x), m), q) in v.iter_mut().zip(x).zip(means).zip(squares) {
+            for ((v, x), [m, q]) in v.iter_mut().zip(x).zip(one) {
                 *v = fma::<T, FMA>(*x + *x, *q, *m);
             }
         } else {
-            let (more_means, more_squares) = two.split_at(width);
-            let rows = means.iter().zip(more_means).zip(squares.iter().zip(more_squares));
-            for ((v, x), ((m, m2), (q, q2))) in v.iter_mut().zip(x).zip(rows) {
+            for (((v, x), [m, q]), [m2, q2]) in v.iter_mut().zip(x).zip(one).zip(two) {
                 *v = fma::<T, FMA>(*x + *x, *q + *q2, *m + *m2);
             }
         }

@@ -8,7 +8,7 @@ use crate::real::{Real, Task, dispatch, fma};
 use rayon::prelude::*;
 use std::ops::Range;
 
-/// Means and means of squares of the responses, `[rows of cells, filters, 2, columns of cells]`; where pooling changes
+/// Means and means of squares of the responses, `[rows of cells, filters, columns of cells, 2]`; where pooling changes
 /// nothing, the responses, `[rows, filters, columns]`.
 pub(super) fn of<T: Real>(plane: &Plane<T>, pools: &Pools<T>, kernels: &[Kernel<T>], antisymmetric: bool) -> Vec<T> {
     let n = kernels.len();
@@ -91,9 +91,8 @@ impl<T: Real> Task for Pool<'_, T> {
             }
             let scale = pools.y.area.inverse_count(i);
             for (o, cells) in row.chunks_exact_mut(2 * columns).enumerate() {
-                let (means, mean_squares) = cells.split_at_mut(columns);
-                pools.x.area.means(&sums[o * width..][..width], scale, means);
-                pools.x.area.means(&squares[o * width..][..width], scale, mean_squares);
+                let rows = [&sums[o * width..][..width], &squares[o * width..][..width]];
+                pools.x.area.means(rows, scale, cells.as_chunks_mut().0);
             }
         }
     }

@@ -210,7 +210,7 @@ impl<T: Real> Axis<T> {
 
     /// Whether pooling changes nothing: a whole number of cells in every sample.
     pub fn is_identity(&self) -> bool {
-        self.area.num_cells() % self.area.num_samples() == 0
+        self.area.num_cells().is_multiple_of(self.area.num_samples())
     }
 }
 

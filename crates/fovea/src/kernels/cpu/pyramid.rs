@@ -4,8 +4,14 @@
 //! 32 columns whose sums stay in registers; the last block of a row overlaps the one before it, rows shorter than a block
 //! use blocks of 4 (every width is a multiple of 4). NaN spreads as arithmetic spreads it. No plane is empty.
 
+mod resize;
+#[cfg(test)]
+mod tests;
+
+pub use resize::ImageView;
+pub(crate) use resize::Resize;
+
 use crate::hvs::pyramid::{FilterBank, Taps};
-use crate::kernels::cpu::pooling::Bilinear;
 use crate::real::{Real, fma};
 use rayon::prelude::*;
 
@@ -15,19 +21,6 @@ pub(crate) const RADIUS: usize = 2;
 pub(crate) const BLOCK: usize = 32;
 /// Columns of a block of a short row: all widths are multiples of it.
 pub(crate) const SMALL_BLOCK: usize = 4;
-
-/// Colour values of an image on the host.
-#[derive(Debug, Clone, Copy)]
-pub struct ImageView<'a, T> {
-    /// Width in pixels.
-    pub width: usize,
-    /// Height in pixels.
-    pub height: usize,
-    /// Values per pixel, at least 3; the first three are RGB, sRGB-encoded, nominally 0..1; the others are not looked at.
-    pub channels: usize,
-    /// `[height, width, channels]`.
-    pub data: &'a [T],
-}
 
 /// One channel of one level: rows with two reflected columns on each side.
 #[derive(Debug, Clone)]
@@ -329,220 +322,4 @@ pub(crate) fn halve_bwd<T: Real>(v_half: &[T], v_plane: &mut [T], width: usize) 
             pair[1] += quarter * *v;
         }
     });
-}
-
-/// Y, Cr, Cb of an encoded colour (ITU-R BT.601).
-#[inline(always)]
-fn ycrcb<T: Real>(r: T, g: T, b: T) -> [T; 3] {
-    let y = (T::of(0.299) * r + T::of(0.587) * g) + T::of(0.114) * b;
-    [y, T::of(0.5) + T::of(0.713) * (r - y), T::of(0.5) + T::of(0.564) * (b - y)]
-}
-
-/// Adjoint of [`ycrcb`].
-#[inline(always)]
-fn ycrcb_bwd<T: Real>(v_y: T, v_cr: T, v_cb: T) -> [T; 3] {
-    let v_cr = T::of(0.713) * v_cr;
-    let v_cb = T::of(0.564) * v_cb;
-    let v_y = v_y - (v_cr + v_cb);
-    [T::of(0.299) * v_y + v_cr, T::of(0.587) * v_y, T::of(0.114) * v_y + v_cb]
-}
-
-/// How an image is brought to the size the pyramid needs.
-#[derive(Debug, Clone)]
-pub(crate) struct Resize<T> {
-    /// Size of the image: width, height.
-    pub from: (usize, usize),
-    /// Size of the planes.
-    pub to: (usize, usize),
-    columns: Bilinear<T>,
-    rows: Bilinear<T>,
-}
-
-impl<T: Real> Resize<T> {
-    pub fn new(from: (usize, usize), to: (usize, usize)) -> Self {
-        Self { from, to, columns: Bilinear::new(to.0, from.0), rows: Bilinear::new(to.1, from.1) }
-    }
-
-    /// Channels Y, Cr, Cb of the resized image. Bilinear interpolation keeps an image whose size is right as it is.
-    pub fn planes(&self, image: &ImageView<'_, T>) -> [Plane<T>; 3] {
-        let (width, height) = self.to;
-        let mut planes: [Plane<T>; 3] = std::array::from_fn(|_| Plane::zeros(width, height));
-        let [y_plane, cr_plane, cb_plane] = &mut planes;
-        let rows = y_plane.rows_mut().zip(cr_plane.rows_mut()).zip(cb_plane.rows_mut()).enumerate();
-        let c = image.channels;
-        rows.for_each(|(row, ((ys, crs), cbs))| {
-            let input = |r: usize| &image.data[r * image.width * c..][..image.width * c];
-            let (upper, lower, down) = self.rows.source(row);
-            let (upper, lower) = (input(upper), input(lower));
-            for x in 0..width {
-                let at = RADIUS + x;
-                let (left, right, across) = self.columns.source(x);
-                let value = |channel: usize| {
-                    let mix = |row: &[T]| {
-                        let (a, b) = (row[left * c + channel], row[right * c + channel]);
-                        if across == T::ZERO { a } else { (T::ONE - across) * a + across * b }
-                    };
-                    if down == T::ZERO { mix(upper) } else { (T::ONE - down) * mix(upper) + down * mix(lower) }
-                };
-                [ys[at], crs[at], cbs[at]] = ycrcb(value(0), value(1), value(2));
-            }
-            for plane_row in [ys, crs, cbs] {
-                reflect_columns(plane_row, width);
-            }
-        });
-        planes
-    }
-
-    /// The gradient by the image, `[height, width, channels]`, zero beyond RGB, from those by the three planes, each
-    /// `[height, width]` of the resized size; these are overwritten.
-    pub fn planes_bwd(&self, v_planes: &mut [Vec<T>; 3], channels: usize) -> Vec<T> {
-        let (width, _) = self.to;
-        let [v_y, v_cr, v_cb] = v_planes;
-        v_y.par_chunks_mut(width).zip(v_cr.par_chunks_mut(width)).zip(v_cb.par_chunks_mut(width)).for_each(
-            |((v_y, v_cr), v_cb)| {
-                for ((y, cr), cb) in v_y.iter_mut().zip(v_cr).zip(v_cb) {
-                    [*y, *cr, *cb] = ycrcb_bwd(*y, *cr, *cb);
-                }
-            },
-        );
-        let v_planes = [&*v_y, &*v_cr, &*v_cb];
-        let mut v_image = vec![T::ZERO; self.from.0 * self.from.1 * channels];
-        v_image.par_chunks_mut(self.from.0 * channels).enumerate().for_each(|(row, v_row)| {
-            let mut sums = vec![T::ZERO; width];
-            for (channel, plane) in v_planes.iter().enumerate() {
-                sums.fill(T::ZERO);
-                for (r, weight) in self.rows.targets(row) {
-                    for (sum, v) in sums.iter_mut().zip(&plane[r * width..][..width]) {
-                        *sum += weight * *v;
-                    }
-                }
-                for (x, pixel) in v_row.chunks_exact_mut(channels).enumerate() {
-                    pixel[channel] = self.columns.gathered(x, &sums);
-                }
-            }
-        });
-        v_image
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use gazesplat_testkit::Rng;
-
-    fn noise(rng: &mut Rng, n: usize) -> Vec<f64> {
-        (0..n).map(|_| 2.0 * rng.unit() - 1.0).collect()
-    }
-
-    fn dot(a: &[f64], b: &[f64]) -> f64 {
-        a.iter().zip(b).map(|(a, b)| a * b).sum()
-    }
-
-    fn plane(width: usize, height: usize, values: &[f64]) -> Plane<f64> {
-        let mut plane = Plane::zeros(width, height);
-        plane.fill_rows(|y, row| row.copy_from_slice(&values[y * width..][..width]));
-        plane
-    }
-
-    #[test]
-    fn borders_are_reflected_without_repeating_the_edge() {
-        assert_eq!([-2, -1, 0, 5, 6, 7].map(|i| reflect(i, 6)), [2, 1, 0, 5, 4, 3]);
-    }
-
-    /// Σ of the definition, with every tap.
-    #[test]
-    fn filters_match_their_definition() {
-        let mut rng = Rng::new(3);
-        let filters = Filters::<f64>::new(&FilterBank::sp5());
-        assert!(filters.antisymmetric);
-        for (width, height) in [(4, 4), (8, 6), (36, 5), (64, 9)] {
-            let values = noise(&mut rng, width * height);
-            let plane = plane(width, height, &values);
-            let mut out = vec![0.0; 6 * width];
-            let mut other = out.clone();
-            for y in 0..height {
-                correlate_row::<f64, false, 6>(&plane, y, &filters.bands, true, &mut out);
-                correlate_row::<f64, false, 6>(&plane, y, &filters.bands, false, &mut other);
-                for (o, k) in filters.bands.iter().enumerate() {
-                    for x in 0..width {
-                        let mut sum = 0.0;
-                        for i in 0..5 {
-                            for j in 0..5 {
-                                let (r, c) = ((y + i) as isize - 2, (x + j) as isize - 2);
-                                sum += k[5 * i + j] * values[reflect(r, height) * width + reflect(c, width)];
-                            }
-                        }
-                        assert!((out[o * width + x] - sum).abs() < 1e-14);
-                        assert!((other[o * width + x] - sum).abs() < 1e-14);
-                    }
-                }
-            }
-        }
-    }
-
-    /// ⟨A x, y⟩ = ⟨x, Aᵀ y⟩.
-    #[test]
-    fn adjoint_of_every_filter_with_its_border() {
-        let mut rng = Rng::new(4);
-        let filters = Filters::<f64>::new(&FilterBank::sp5());
-        let kernels = [&filters.bands[..], &[filters.low, filters.high]].concat();
-        for (width, height) in [(4, 4), (8, 5), (32, 4), (40, 7), (68, 6)] {
-            let (x, v) = (noise(&mut rng, width * height), noise(&mut rng, width * height));
-            let plane = plane(width, height, &x);
-            for kernel in &kernels {
-                let kernel = &[*kernel][..];
-                let (mut forward, mut v_x) = (vec![0.0; width * height], vec![0.0; width * height]);
-                let padded: Vec<Vec<f64>> =
-                    v.chunks(width).map(|row| [&[0.0; GRADIENT_PAD][..], row, &[0.0; GRADIENT_PAD]].concat()).collect();
-                let zeros = vec![0.0; width + 2 * GRADIENT_PAD];
-                let mut reached = vec![0.0; width + 4];
-                for y in 0..height {
-                    let rows = y * width..(y + 1) * width;
-                    correlate_row::<f64, false, 1>(&plane, y, kernel, false, &mut forward[rows.clone()]);
-                    correlate_row_bwd::<f64, false, 1>(
-                        |_, r| &padded[r],
-                        &zeros,
-                        (y, height),
-                        &[flipped(&kernel[0])],
-                        &mut reached,
-                        &mut v_x[rows],
-                    );
-                }
-                let (a, b) = (dot(&forward, &v), dot(&x, &v_x));
-                assert!((a - b).abs() <= 1e-12 * (1.0 + a.abs()), "{width}×{height}: {a} {b}");
-            }
-        }
-    }
-
-    #[test]
-    fn adjoint_of_halving_colour_and_resizing() {
-        let mut rng = Rng::new(5);
-        let (x, v) = (noise(&mut rng, 8 * 6), noise(&mut rng, 4 * 3));
-        let half = halve(&plane(8, 6, &x));
-        let forward: Vec<f64> = (0..3).flat_map(|y| half.row(y).to_vec()).collect();
-        let mut v_x = vec![0.0; 48];
-        halve_bwd(&v, &mut v_x, 8);
-        assert!((dot(&forward, &v) - dot(&x, &v_x)).abs() < 1e-13);
-
-        for from in [(2usize, 3usize), (31, 17), (32, 64), (33, 67), (67, 2)] {
-            let to = (from.0.next_multiple_of(32), from.1.next_multiple_of(32));
-            let resize = Resize::<f64>::new(from, to);
-            let x = noise(&mut rng, from.0 * from.1 * 4);
-            let mut v: [Vec<f64>; 3] = std::array::from_fn(|_| noise(&mut rng, to.0 * to.1));
-            let view = |data| ImageView { width: from.0, height: from.1, channels: 4, data };
-            let zero = vec![0.0; x.len()];
-            // The colour transform has a constant part, which the gradient does not see.
-            let (planes, offsets) = (resize.planes(&view(&x)), resize.planes(&view(&zero)));
-            let mut forward = 0.0;
-            for c in 0..3 {
-                for y in 0..to.1 {
-                    let difference = planes[c].row(y).iter().zip(offsets[c].row(y)).map(|(a, b)| a - b);
-                    forward += dot(&difference.collect::<Vec<_>>(), &v[c][y * to.0..][..to.0]);
-                }
-            }
-            let v_x = resize.planes_bwd(&mut v, 4);
-            let backward = dot(&x, &v_x);
-            assert!((forward - backward).abs() < 1e-11 * (1.0 + forward.abs()), "{from:?}: {forward} {backward}");
-        }
-    }
 }

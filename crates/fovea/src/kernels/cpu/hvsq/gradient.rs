@@ -200,7 +200,7 @@ impl<T: Real> SpreadRows<T> {
             1
         };
         let (even, odd) = slots.split_at(width);
-        let (one, two) = if cells.start % 2 == 0 { (even, odd) } else { (odd, even) };
+        let (one, two) = if cells.start.is_multiple_of(2) { (even, odd) } else { (odd, even) };
         if num_slots == 1 {
             for ((v, x), [m, q]) in v.iter_mut().zip(x).zip(one) {
                 *v = fma::<T, FMA>(*x + *x, *q, *m);

@@ -144,8 +144,9 @@ fn pool_as_large_as_the_image_takes_global_statistics() {
     let plan = plan::<f64>(size, uniform(32.0), Distance::Mse);
     let planes = [&a, &b].map(|image| plan.resize.planes(&view(image, size)));
     let mut expected = 0.0;
-    for c in 0..3 {
-        let [low_a, low_b] = [0, 1].map(|i| plan.levels(&planes[i][c]));
+    let [planes_a, planes_b] = planes;
+    for (plane_a, plane_b) in planes_a.iter().zip(&planes_b) {
+        let [low_a, low_b] = [plane_a, plane_b].map(|plane| plan.levels(plane));
         let mut add = |a: &Plane<f64>, b: &Plane<f64>, kernel: &Kernel<f64>| {
             let [a, b] = [a, b].map(|plane| {
                 let n = (plane.width * plane.height) as f64;
@@ -160,7 +161,7 @@ fn pool_as_large_as_the_image_takes_global_statistics() {
             });
             expected += (a.0 - b.0).powi(2) + (a.1 - b.1).powi(2);
         };
-        add(&planes[0][c], &planes[1][c], &plan.filters.high);
+        add(plane_a, plane_b, &plan.filters.high);
         for l in 0..BAND_LEVELS {
             for kernel in &plan.filters.bands {
                 add(&low_a[l], &low_b[l], kernel);

@@ -1,6 +1,6 @@
 //! The command line: what is accepted, explained, and which command it becomes. Nothing is opened here.
 
-use crate::commands::{demo, eval, hvsq, info, render, synth, train};
+use crate::commands::{bench, demo, eval, hvsq, info, lut, render, synth, train};
 use crate::console::Console;
 use crate::diagnostics::Result;
 use crate::settings;
@@ -69,6 +69,10 @@ pub enum Command {
     Demo(demo::DemoArgs),
     /// Say what is in a model, a scene, a camera path or a run; or which devices there are
     Info(info::InfoArgs),
+    /// Write a table of the transmittances at which a pixel may stop, from colour science
+    Lut(lut::LutArgs),
+    /// Measure what a part of the program gains and costs
+    Bench(bench::BenchArgs),
 }
 
 /// Parses the arguments of this process and runs the command.
@@ -96,6 +100,8 @@ pub fn run() -> Result<()> {
         Command::Synth(args) => synth::command(&args, &console),
         Command::Demo(args) => demo::command(&args, &console),
         Command::Info(args) => info::command(&args, &console),
+        Command::Lut(args) => lut::command(&args, &console),
+        Command::Bench(args) => bench::command(&args, &console),
     }
 }
 

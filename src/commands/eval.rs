@@ -2,6 +2,7 @@
 
 use super::device::ComputeDevice;
 use super::hvsq_args::{self, HvsqArgs, Measured, Measures};
+use super::termination::TerminationArgs;
 use super::{Model, Split, load_scene, log_machine, quality};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, grouped};
@@ -44,6 +45,9 @@ pub struct EvalArgs {
     /// Which views of the scene
     #[arg(long, value_enum, default_value = "test")]
     pub split: Split,
+    /// When a pixel stops
+    #[command(flatten)]
+    pub termination: TerminationArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -63,8 +67,9 @@ pub struct EvalArgs {
 /// # Errors
 /// When the device, the model or the scene cannot be used, or the quality is below `--min-psnr`.
 pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
+    args.termination.check()?;
     let device = ComputeDevice::open(args.device.device, console)?;
-    device.guard(|| eval(args, &device, console))
+    eval(args, &device, console)
 }
 
 fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
@@ -75,15 +80,17 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
     let report = with_threads(config.train.threads, || {
         log_machine();
-        let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-        let options = config.render_options();
-        match &measures {
-            None => Ok((quality::measure(&splats, &images, &options, console)?, None)),
-            Some(measures) => {
-                let (report, hvsq) = measure_hvsq(args, measures, &splats, &images, &options, console)?;
-                Ok::<_, Failure>((report, Some(hvsq)))
+        let options = RenderOptions { termination: args.termination.termination()?, ..config.render_options() };
+        device.guard(|| {
+            let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
+            match &measures {
+                None => Ok((quality::measure(&splats, &images, &options, console)?, None)),
+                Some(measures) => {
+                    let (report, hvsq) = measure_hvsq(args, measures, &splats, &images, &options, console)?;
+                    Ok::<_, Failure>((report, Some(hvsq)))
+                }
             }
-        }
+        })
     })??;
     let (report, hvsq) = report;
     let hvsq = hvsq.map(|views| HvsqOfViews { mean: hvsq_args::mean(&views), views });

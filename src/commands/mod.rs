@@ -1,13 +1,16 @@
 //! The commands of the program, one file each, and what several of them share: scenes, models, threads.
 
+pub mod bench;
 pub mod demo;
 pub mod device;
 pub mod eval;
 pub mod hvsq;
 pub mod hvsq_args;
 pub mod info;
+pub mod lut;
 pub mod render;
 pub mod synth;
+pub mod termination;
 pub mod train;
 
 mod devices;

@@ -2,6 +2,7 @@
 
 use super::device::ComputeDevice;
 use super::frames::{self, NamedCamera};
+use super::termination::TerminationArgs;
 use super::{Model, Split, load_scene, log_machine};
 use crate::cli::{DeviceArgs, SettingsArgs, Size, parse_fov_deg, parse_rgb, parse_size};
 use crate::console::{Console, duration};
@@ -26,6 +27,7 @@ const SCENE_FPS: f32 = 30.0;
 Examples:
   gazesplat render runs/fox-1 --scene fox --split test --out frames
   gazesplat render model.ply --path orbit.json --size 1280x720 --out orbit.y4m --device gpu
+  gazesplat render model.ply --scene fox --termination jnd --out frames
   ffmpeg -i orbit.y4m -crf 16 orbit.mp4
 
 A .y4m video is raw: YUV 4:4:4, 8 bit, BT.709, limited range. Players and encoders read it as it is.
@@ -60,6 +62,9 @@ pub struct RenderArgs {
     /// Colour behind everything, channels 0 to 1 [default: the run's, or 0,0,0]
     #[arg(long, value_name = "R,G,B", value_parser = parse_rgb)]
     pub background: Option<[f32; 3]>,
+    /// When a pixel stops
+    #[command(flatten)]
+    pub termination: TerminationArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -77,8 +82,9 @@ pub struct RenderArgs {
 /// When the device cannot be used, the model, the cameras or an option is wrong, or the frames cannot be written.
 pub fn command(args: &RenderArgs, console: &Console) -> Result<()> {
     let target = Target::new(args)?;
+    args.termination.check()?;
     let device = ComputeDevice::open(args.device.device, console)?;
-    device.guard(|| render(args, &target, &device, console))
+    render(args, &target, &device, console)
 }
 
 fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &Console) -> Result<()> {
@@ -92,6 +98,7 @@ fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &
     options.near = args.near.unwrap_or(options.near);
     options.background = args.background.unwrap_or(options.background);
     options.stats = if args.stats { StatsMode::All } else { StatsMode::None };
+    options.termination = args.termination.termination()?;
     options.validate()?;
 
     let (mut cameras, fps): (Vec<NamedCamera>, f32) = match (&args.scene, &args.path) {
@@ -112,20 +119,22 @@ fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &
         camera.intrinsics = replaced(camera.intrinsics, args.size, args.fov);
     }
 
-    let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
     let bar = progress::counting_bar(console, "rendering", cameras.len());
     let started = Instant::now();
     let mut stats: Vec<(String, RenderStats)> = Vec::new();
-    let frame = |camera: &NamedCamera| {
-        let (image, counters) = frames::draw(&splats, &camera.1, &options)?;
-        stats.push((camera.0.clone(), counters));
-        bar.inc(1);
-        Ok(image)
-    };
-    match target {
-        Target::Pngs(dir) => frames::write_pngs(dir, &cameras, frame)?,
-        Target::Video(file) => frames::write_video(file, &cameras, fps, frame)?,
-    }
+    device.guard(|| {
+        let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
+        let frame = |camera: &NamedCamera| {
+            let (image, counters) = frames::draw(&splats, &camera.1, &options)?;
+            stats.push((camera.0.clone(), counters));
+            bar.inc(1);
+            Ok(image)
+        };
+        match target {
+            Target::Pngs(dir) => frames::write_pngs(dir, &cameras, frame),
+            Target::Video(file) => frames::write_video(file, &cameras, fps, frame),
+        }
+    })?;
     bar.finish_and_clear();
     let (n, secs) = (cameras.len(), started.elapsed().as_secs_f64());
     match target {

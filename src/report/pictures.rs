@@ -43,7 +43,7 @@ pub fn error_map(a: &RgbImage8, b: &RgbImage8) -> RgbImage8 {
 }
 
 /// Black, violet, red, amber, pale yellow: rises evenly in lightness, so it reads in greyscale too.
-fn heat(x: f32) -> [u8; 3] {
+pub fn heat(x: f32) -> [u8; 3] {
     const STOPS: [[f32; 3]; 5] =
         [[8.0, 8.0, 16.0], [84.0, 20.0, 110.0], [187.0, 55.0, 84.0], [249.0, 142.0, 9.0], [252.0, 255.0, 190.0]];
     let x = x.clamp(0.0, 1.0) * (STOPS.len() - 1) as f32;

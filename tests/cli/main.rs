@@ -13,4 +13,5 @@ mod render;
 mod settings;
 mod support;
 mod synth;
+mod termination;
 mod train;

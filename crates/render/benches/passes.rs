@@ -6,7 +6,7 @@
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
 use gazesplat_core::synthetic::{bench_camera, bench_cloud};
 use gazesplat_core::{Camera, GaussianCloud};
-use gazesplat_render::kernels::cpu::bin::{TileGrid, TileLists, bin};
+use gazesplat_render::kernels::cpu::bin::{BinExtras, TileGrid, TileLists, bin};
 use gazesplat_render::kernels::cpu::project::{GaussianSlices, ProjectedSplats, ViewSpec, project};
 use gazesplat_render::kernels::cpu::project_bwd::project_bwd;
 use gazesplat_render::kernels::cpu::rasterize::{RasterOptions, rasterize};
@@ -18,8 +18,16 @@ use gazesplat_render::simd::{SimdLevel, force_level};
 use gazesplat_render::view_params::view_params;
 use std::hint::black_box;
 
-const OPTIONS: RasterOptions =
-    RasterOptions { alpha_max: ALPHA_MAX, t_stop: T_STOP, background: [0.0; 3], depth: false, smooth_cutoff: false };
+const OPTIONS: RasterOptions = RasterOptions {
+    alpha_max: ALPHA_MAX,
+    t_stop: T_STOP,
+    lut: None,
+    background: [0.0; 3],
+    depth: false,
+    smooth_cutoff: false,
+};
+
+const RECORDS: BinExtras = BinExtras { records: true, color_max: false };
 
 fn slices(cloud: &GaussianCloud) -> GaussianSlices<'_> {
     GaussianSlices {
@@ -45,7 +53,7 @@ fn view(camera: &Camera) -> ViewSpec {
 fn binned(cloud: &GaussianCloud, camera: &Camera) -> (ProjectedSplats<'static>, TileLists<'static>) {
     let splats = project(&slices(cloud), &view(camera), None);
     let grid = TileGrid::new(camera.intrinsics.width, camera.intrinsics.height);
-    let lists = bin(&splats, grid, true).expect("the bench scene is within limits");
+    let lists = bin(&splats, grid, RECORDS).expect("the bench scene is within limits");
     (splats, lists)
 }
 
@@ -68,7 +76,7 @@ fn passes(c: &mut Criterion) {
         println!("visible {}, pairs {}, {:?}", splats.len(), lists.pair_splats.len(), raster.stats);
         group.bench_function("project", |b| b.iter(|| project(black_box(&g), &spec, None)));
         group.bench_function("sort", |b| b.iter(|| depth_order(black_box(&depths))));
-        group.bench_function("bin", |b| b.iter(|| bin(black_box(&splats), lists.grid, true)));
+        group.bench_function("bin", |b| b.iter(|| bin(black_box(&splats), lists.grid, RECORDS)));
         group.bench_function("rasterize", |b| {
             b.iter(|| rasterize(splats.rows(), black_box(&lists), &OPTIONS, StatsLevel::None, true));
         });

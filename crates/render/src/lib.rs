@@ -25,6 +25,7 @@ pub mod renderer;
 pub mod simd;
 pub mod splats;
 pub mod stats;
+pub mod termination;
 pub mod view_params;
 
 pub use backend::host;
@@ -32,7 +33,8 @@ pub use backend::host;
 pub use device::flex_device;
 pub use device::{DeviceChoice, cpu_device, is_gpu};
 pub use error::{Error, Result};
-pub use options::{Pass, RenderOptions, StatsMode, Termination};
+pub use options::{Pass, RenderOptions, StatsMode};
 pub use renderer::{MeansProbe, Rendered, render, render_probed};
 pub use splats::Splats;
 pub use stats::{RenderStats, SplatStats};
+pub use termination::{ColorMax, Residual, Termination, TerminationLut};

@@ -2,14 +2,7 @@
 
 use crate::error::{Error, Result};
 use crate::layout;
-
-/// When a pixel stops compositing.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Termination {
-    /// Before the splat that would bring the transmittance T(1−α) to this value or below; 0 = never
-    /// (down to [`layout::T_FLOOR`], where f32 ends).
-    Fixed(f32),
-}
+use crate::termination::Termination;
 
 /// Which per-Gaussian counters a frame fills (see [`crate::SplatStats`]). Each costs time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -37,7 +30,7 @@ pub enum Pass {
 }
 
 /// Options of one frame; [`Default`] is what every 3DGS viewer shows.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RenderOptions {
     /// Gaussians with camera-space z at or below this are culled; world units, > 0, default 0.01.
     pub near: f32,
@@ -96,8 +89,13 @@ impl RenderOptions {
             self.alpha_max.to_string(),
             "a value above 1/255 and at most 0.9999",
         )?;
-        let Termination::Fixed(t_stop) = self.termination;
-        check((0.0..1.0).contains(&t_stop), "termination", t_stop.to_string(), "a transmittance in [0, 1)")?;
+        self.termination.validate()?;
+        check(
+            self.pass == Pass::Inference || matches!(self.termination, Termination::Fixed(_)),
+            "termination",
+            "a table in a pass with gradients".to_owned(),
+            "a fixed transmittance: tables are for inference",
+        )?;
         check(
             self.background.iter().all(|c| c.is_finite()),
             "background",

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 use crate::kernels::cpu::project::ViewSpec;
 use crate::kernels::cpu::rasterize::RasterOptions;
 use crate::layout::T_FLOOR;
-use crate::options::{Pass, RenderOptions, Termination};
+use crate::options::{Pass, RenderOptions};
 use crate::splats::Splats;
 use crate::stats::{RenderStats, SplatStats};
 use crate::view_params::view_params;
@@ -84,7 +84,7 @@ fn frame(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Fr
     check_shapes(splats)?;
     let stored = splats.sh_degree();
     let sh_degree = options.sh_degree.unwrap_or(stored).min(stored);
-    let Termination::Fixed(t_stop) = options.termination;
+    let (t_stop, lut) = options.termination.resolve();
     Ok(Frame {
         view: ViewSpec {
             params: view_params(camera)?,
@@ -95,6 +95,7 @@ fn frame(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Fr
         raster: RasterOptions {
             alpha_max: options.alpha_max,
             t_stop: t_stop.max(T_FLOOR),
+            lut,
             background: options.background,
             depth: options.depth,
             smooth_cutoff: options.pass == Pass::SmoothCutoff,

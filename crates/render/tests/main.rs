@@ -12,3 +12,4 @@ mod lost_device;
 mod random_values;
 mod stability;
 mod stability_limits;
+mod termination;

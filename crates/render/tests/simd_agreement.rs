@@ -3,8 +3,9 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use gazesplat_render::StatsMode;
+use gazesplat_core::color::ColorSpace;
 use gazesplat_render::simd::{self, SimdLevel};
+use gazesplat_render::{StatsMode, Termination, TerminationLut};
 use gazesplat_testkit::{Tolerance, assert_close};
 
 #[expect(dead_code, unused_macros, unused_imports, reason = "this binary needs some of the scenes only")]
@@ -124,5 +125,32 @@ fn one_level_gives_the_same_bits_twice() {
         let (frame, gradients) = run(scene, level, &weights);
         let (again, again_gradients) = run(scene, level, &weights);
         assert!(frame == again && gradients == again_gradients, "{level:?}");
+    }
+}
+
+/// Gathers, clamps and rounding of indices are written per level.
+#[test]
+fn every_level_stops_by_a_table_as_the_reference_does() {
+    let _lock = lock();
+    for (k, mut scene) in scenes().into_iter().enumerate() {
+        for size in [8, 13] {
+            let mut rng = gazesplat_testkit::Rng::new(k as u64);
+            let values = (0..size * size * size).map(|_| rng.range(0.003, 0.05)).collect();
+            let lut = TerminationLut::new(size, values, ColorSpace::Srgb).expect("legal");
+            scene.options.termination = Termination::Lut(lut);
+            scene.options.stats = StatsMode::All;
+            let reference = scene.reference();
+            let expected = sturdy(&interleaved(&reference, 5), 5, &reference.fragile);
+            for level in levels() {
+                let what = format!("scene {k}, {size} cells, {level:?}");
+                let frame = at(level, || scene.frame());
+                let found = sturdy(&frame.image, 5, &reference.fragile);
+                assert_close(&what, &found, &expected, Tolerance::max_abs(2e-4));
+                for (i, c) in reference.counters.iter().enumerate() {
+                    let found = frame.splat_stats.pixels_blended[i];
+                    assert!(found.abs_diff(c.pixels_blended) <= c.slack_pixels, "{what}: pixels of {i}");
+                }
+            }
+        }
     }
 }

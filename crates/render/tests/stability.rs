@@ -454,13 +454,13 @@ fn options_out_of_range_are_refused() {
     let scene = random(1, Draw::default());
     let default = options();
     for options in [
-        RenderOptions { near: 0.0, ..default },
-        RenderOptions { near: f32::NAN, ..default },
-        RenderOptions { alpha_max: 1.0, ..default },
-        RenderOptions { alpha_max: 0.0, ..default },
-        RenderOptions { termination: Termination::Fixed(1.0), ..default },
-        RenderOptions { termination: Termination::Fixed(f32::NAN), ..default },
-        RenderOptions { background: [0.0, f32::INFINITY, 0.0], ..default },
+        RenderOptions { near: 0.0, ..default.clone() },
+        RenderOptions { near: f32::NAN, ..default.clone() },
+        RenderOptions { alpha_max: 1.0, ..default.clone() },
+        RenderOptions { alpha_max: 0.0, ..default.clone() },
+        RenderOptions { termination: Termination::Fixed(1.0), ..default.clone() },
+        RenderOptions { termination: Termination::Fixed(f32::NAN), ..default.clone() },
+        RenderOptions { background: [0.0, f32::INFINITY, 0.0], ..default.clone() },
     ] {
         assert!(scene.refusal(&options).is_some(), "{options:?} is accepted");
     }

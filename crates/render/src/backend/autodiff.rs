@@ -1,6 +1,7 @@
 //! The hand-written backward pass, hooked into Burn's autodiff.
 
 use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved, host::shape_of};
+use crate::error::Error;
 use burn::backend::{
     Autodiff, AutodiffBackend,
     autodiff::{
@@ -36,6 +37,15 @@ impl<B: RenderOps> ops::Backward<B, 6> for RenderBackward {
                 grads.register::<B>(node.id, value);
             }
         }
+    }
+}
+
+/// A stop that the colour decides is no function with a gradient, and nothing is kept for one.
+fn no_gradient_through_a_table() -> Error {
+    Error::Parameter {
+        name: "termination",
+        found: "a table for a model whose gradient is tracked".to_owned(),
+        expected: "a fixed transmittance, or a model without its graph",
     }
 }
 
@@ -81,11 +91,13 @@ impl<B: RenderOps, C: CheckpointStrategy> RenderOps for Autodiff<B, C> {
         let with_probe = shape_of::<B>(&inner_probe.means2d)[0] > 0;
         match prepared {
             OpsKind::Tracked(prepared) => {
-                let frame = Frame { keep: true, ..frame };
-                let out = B::render_forward(parameters.clone(), inner_probe, frame);
+                let has_table = frame.raster.lut.is_some();
+                let frame = Frame { keep: !has_table, ..frame };
+                let out = B::render_forward(parameters.clone(), inner_probe, frame.clone());
+                let outcome = if has_table { Err(no_gradient_through_a_table()) } else { out.outcome };
                 let saved = constants::<B, C>(out.saved.clone());
                 let state = State { parameters, saved: out.saved, frame, with_probe };
-                Forward { image: prepared.finish(state, out.image), saved, outcome: out.outcome }
+                Forward { image: prepared.finish(state, out.image), saved, outcome }
             }
             OpsKind::UnTracked(prepared) => {
                 let out = B::render_forward(parameters, inner_probe, frame);

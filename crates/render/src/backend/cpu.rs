@@ -5,7 +5,7 @@ use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved};
 use crate::cluster::clusters;
 use crate::error::Result;
 use crate::kernels::cpu::{
-    bin::{TileGrid, TileLists, bin},
+    bin::{BinExtras, TileGrid, TileLists, bin},
     project::{GaussianSlices, ProjectedSplats, project},
     project_bwd::project_bwd,
     rasterize::{Raster, rasterize},
@@ -52,7 +52,7 @@ pub(crate) fn draw(g: &GaussianSlices<'_>, frame: &Frame, counters: StatsLevel) 
     // Bounds pay when a model is drawn and not changed between frames; a training step reads every row anyway.
     let bounds = (!frame.keep && g.len() > 16 * CLUSTER).then(|| clusters(g));
     let splats = project(g, &frame.view, bounds.as_deref());
-    let lists = bin(&splats, grid, frame.keep)?;
+    let lists = bin(&splats, grid, BinExtras { records: frame.keep, color_max: frame.raster.lut.is_some() })?;
     let raster = rasterize(splats.rows(), &lists, &frame.raster, counters, frame.keep);
     let stats = RenderStats {
         num_splats: g.len() as u64,
@@ -100,15 +100,15 @@ fn saved<B: HostTensors>(frame: HostFrame, size: [usize; 2], keep: bool) -> Save
     }
 }
 
-fn forward<B: HostTensors>(parameters: &Parameters<B>, frame: Frame) -> Forward<B> {
+fn forward<B: HostTensors>(parameters: &Parameters<B>, frame: &Frame) -> Forward<B> {
     let size = [frame.view.height as usize, frame.view.width as usize];
     let image_shape = [size[0], size[1], frame.raster.num_channels()];
     let drawn = with_slices(parameters, frame.sh_degree, |g| {
-        let mut drawn = draw(g, &frame, StatsLevel::None)?;
+        let mut drawn = draw(g, frame, StatsLevel::None)?;
         // Pixel counters come from a pass of their own: counting in the plain kernel would slow every frame.
         let level = StatsLevel::from_mode(frame.stats);
         if level != StatsLevel::None {
-            let counted = draw(g, &Frame { keep: false, ..frame }, level)?;
+            let counted = draw(g, &Frame { keep: false, ..frame.clone() }, level)?;
             drawn.splat_stats = counted.splat_stats;
             drawn.stats.num_blended = counted.stats.num_blended;
         }
@@ -169,6 +169,7 @@ fn backward<B: HostTensors>(
         pair_splats: unsigned(&pairs),
         record_offsets: unsigned(&record_offsets),
         record_pairs: unsigned(&records),
+        color_max: Cow::default(),
         num_pairs_box: 0,
     };
     let raster = Raster {
@@ -200,7 +201,7 @@ macro_rules! host_render_ops {
     ($backend:ty) => {
         impl RenderOps for $backend {
             fn render_forward(parameters: Parameters<Self>, _probe: Probe<Self>, frame: Frame) -> Forward<Self> {
-                forward(&parameters, frame)
+                forward(&parameters, &frame)
             }
 
             fn render_backward(

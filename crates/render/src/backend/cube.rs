@@ -15,6 +15,7 @@ use crate::kernels::gpu::{
 };
 use crate::layout::{TILE, grad_lane, lane};
 use crate::stats::{RenderStats, SplatStats};
+use crate::termination::ColorMax;
 use burn::backend::tensor::FloatTensor;
 use burn::tensor::DType;
 use burn_cubecl::{CubeBackend, tensor::CubeTensor};
@@ -29,8 +30,12 @@ struct DeviceFrame {
 
 fn draw(gpu: &Gpu, g: &GaussianBuffers, frame: &Frame) -> Result<DeviceFrame> {
     let grid = TileGrid::new(frame.view.width, frame.view.height);
+    // What is known to be too large is refused before any work.
+    let (width, height) = (frame.view.width as usize, frame.view.height as usize);
+    gpu.check_size("bytes of the image", &[height, width, frame.raster.num_channels()], DType::F32)?;
     let projected = project(gpu, g, &frame.view)?;
-    let lists = bin(gpu, g, &projected, grid)?;
+    let wants_maximum = frame.raster.lut.as_ref().is_some_and(|lut| lut.color_max() == ColorMax::Tile);
+    let lists = bin(gpu, g, &projected, grid, wants_maximum)?;
     if frame.keep {
         check_backward(gpu, g, lists.num_pairs)?;
     }
@@ -113,6 +118,7 @@ fn backward(
         tile_offsets: saved.tile_offsets,
         pairs: saved.pair_splats,
         record_offsets: saved.record_offsets,
+        color_max: nothing(&gpu, DType::U32),
         num_pairs_box: 0,
         num_non_finite: 0,
     };

@@ -38,7 +38,7 @@ pub struct Parameters<B: Backend> {
 }
 
 /// One frame to draw: everything that is not a tensor.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub struct Frame {
     /// Camera, size, near plane.
     pub view: ViewSpec,

@@ -1,6 +1,6 @@
 //! The AVX2 + FMA level: two registers hold a row.
 
-use super::{Kernel, LANES, Simd};
+use super::{Kernel, LANES, Simd, last_index};
 use std::arch::x86_64::*;
 
 /// Proof that the processor has AVX2 and FMA.
@@ -221,6 +221,22 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn mul_where(self, m: Self::M, a: Self::F, b: Self::F) -> Self::F {
         self.keep(m, self.mul(a, b))
+    }
+    #[inline(always)]
+    fn truncate(self, a: Self::F) -> Self::F {
+        // SAFETY: the token proves AVX2 and FMA. Immediate 3: towards zero.
+        unsafe { Pair(_mm256_round_ps::<3>(a.0), _mm256_round_ps::<3>(a.1)) }
+    }
+    #[inline(always)]
+    fn lookup(self, table: &[f32], index: Self::F) -> Self::F {
+        let last = last_index(table);
+        // SAFETY: the token proves AVX2 and FMA; as an unsigned number no index is behind the last entry.
+        unsafe {
+            let last = _mm256_set1_epi32(last);
+            let read =
+                |i: __m256| _mm256_i32gather_ps::<4>(table.as_ptr(), _mm256_min_epu32(_mm256_cvttps_epi32(i), last));
+            Pair(read(index.0), read(index.1))
+        }
     }
     #[inline(always)]
     fn reduce_max(self, a: Self::F) -> f32 {

@@ -1,6 +1,6 @@
 //! The AVX-512 level: one register holds a row.
 
-use super::{Kernel, LANES, Simd};
+use super::{Kernel, LANES, Simd, last_index};
 use std::arch::x86_64::*;
 
 /// Proof that the processor has AVX-512 F, BW, DQ and VL, AVX2 and FMA.
@@ -188,6 +188,20 @@ impl Simd for Avx512 {
     fn mul_where(self, m: __mmask16, a: __m512, b: __m512) -> __m512 {
         // SAFETY: the token proves AVX-512.
         unsafe { _mm512_maskz_mul_ps(m, a, b) }
+    }
+    #[inline(always)]
+    fn truncate(self, a: __m512) -> __m512 {
+        // SAFETY: the token proves AVX-512. Immediate 3: towards zero.
+        unsafe { _mm512_roundscale_ps::<3>(a) }
+    }
+    #[inline(always)]
+    fn lookup(self, table: &[f32], index: __m512) -> __m512 {
+        let last = last_index(table);
+        // SAFETY: the token proves AVX-512; as an unsigned number no index is behind the last entry.
+        unsafe {
+            let index = _mm512_min_epu32(_mm512_cvttps_epi32(index), _mm512_set1_epi32(last));
+            _mm512_i32gather_ps::<4>(index, table.as_ptr())
+        }
     }
     #[inline(always)]
     fn reduce_max(self, a: __m512) -> f32 {

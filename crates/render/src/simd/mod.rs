@@ -140,6 +140,17 @@ pub fn prefetch<T>(value: &T) {
     let _ = value;
 }
 
+/// Index of the last entry of a table that is gathered from.
+///
+/// # Panics
+/// If the table is empty, or longer than indices reach.
+#[cfg(target_arch = "x86_64")]
+#[inline(always)]
+fn last_index(table: &[f32]) -> i32 {
+    assert!(!table.is_empty() && i32::try_from(table.len()).is_ok(), "a table holds 1 to 2³¹ − 1 entries");
+    table.len() as i32 - 1
+}
+
 /// 2ᶠ as a degree-5 polynomial in f ∈ [0, 1): minimax in relative error with the constant term pinned to 1, highest
 /// power first. Largest relative error 1.4e-7 in `f32` with fused steps.
 pub const EXP2_POLYNOMIAL: [f32; 5] = [1.867_132_4e-3, 9.017_025e-3, 5.579_991_6e-2, 2.401_643_4e-1, 6.931_513e-1];
@@ -213,6 +224,13 @@ pub trait Simd: Copy + Send + Sync + 'static {
     fn scale_by_floor(self, m: Self::M, y: Self::F, p: Self::F) -> Self::F;
     /// a · b where the mask is set, else 0.
     fn mul_where(self, m: Self::M, a: Self::F, b: Self::F) -> Self::F;
+    /// a without its fraction, for 0 ≤ a < 2³¹.
+    fn truncate(self, a: Self::F) -> Self::F;
+    /// The entries of `table` at whole numbers; indices behind its end read its last entry.
+    ///
+    /// # Panics
+    /// If the table is empty.
+    fn lookup(self, table: &[f32], index: Self::F) -> Self::F;
     /// The largest lane.
     fn reduce_max(self, a: Self::F) -> f32;
     /// The sums over the lanes of four vectors, in a fixed order.

@@ -150,6 +150,14 @@ impl Simd for Scalar {
         std::array::from_fn(|i| if m[i] { a[i] * b[i] } else { 0.0 })
     }
     #[inline(always)]
+    fn truncate(self, a: Self::F) -> Self::F {
+        a.map(|a| a as i32 as f32)
+    }
+    #[inline(always)]
+    fn lookup(self, table: &[f32], index: Self::F) -> Self::F {
+        index.map(|i| table[(i as usize).min(table.len() - 1)])
+    }
+    #[inline(always)]
     fn reduce_max(self, a: Self::F) -> f32 {
         a.into_iter().fold(f32::NEG_INFINITY, f32::max)
     }

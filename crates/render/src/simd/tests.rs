@@ -33,6 +33,27 @@ impl Kernel for Reductions {
     }
 }
 
+struct Lookup(Vec<f32>, [f32; LANES]);
+impl Kernel for Lookup {
+    type Output = [f32; LANES];
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> Self::Output {
+        let mut out = [0.0; LANES];
+        s.store(s.lookup(&self.0, s.truncate(s.load(&self.1))), &mut out);
+        out
+    }
+}
+
+#[test]
+fn tables_are_read_inside_their_bounds_on_all_levels() {
+    let indices = [0.0, 0.99, 1.0, 1.5, 2.0, 3.0, 4.9, 5.0, 6.0, 7.0, 1e9, 100.0, 4.0, 4.5, 0.1, 2.999_999];
+    let expected = [0, 0, 1, 1, 2, 3, 4, 5, 6, 6, 6, 6, 4, 4, 0, 2].map(|i| 10.0 + i as f32);
+    each_level(|level| {
+        let table = (0..7).map(|i| 10.0 + i as f32).collect();
+        assert_eq!(dispatch(Lookup(table, indices)), expected, "{level:?}");
+    });
+}
+
 fn each_level(mut f: impl FnMut(SimdLevel)) {
     let _turn = TURN.lock().expect("no test panics while it holds the turn");
     for level in SimdLevel::ALL {

@@ -5,7 +5,8 @@ pub mod scenes;
 use burn::tensor::{Device, Tensor, TensorData};
 use gazesplat_core::{Camera, GaussianCloud};
 use gazesplat_render::{
-    MeansProbe, Pass, RenderOptions, RenderStats, SplatStats, Splats, Termination, cpu_device, render, render_probed,
+    ColorMax, MeansProbe, Pass, RenderOptions, RenderStats, Residual, SplatStats, Splats, Termination, TerminationLut,
+    cpu_device, render, render_probed,
 };
 use gazesplat_testkit::reference;
 use std::cell::RefCell;
@@ -184,7 +185,7 @@ impl Scene {
         let n = self.cloud.len();
         let splats = Splats::from_cloud(&self.cloud, &device).expect("it fits").require_grad();
         let probe = MeansProbe::new(n, &device);
-        let options = RenderOptions { pass: training(self.options.pass), ..self.options };
+        let options = RenderOptions { pass: training(self.options.pass), ..self.options.clone() };
         let out = render_probed(&splats, &probe, &self.camera, &options).expect("the scene is legal");
         let [h, w, c] = out.image.dims();
         let weights = Tensor::<3>::from_data(TensorData::new(upstream.to_vec(), [h, w, c]), &device);
@@ -243,11 +244,15 @@ impl Scene {
 
     /// The options as the reference takes them.
     pub fn reference_options(&self) -> reference::Options {
-        let Termination::Fixed(stop) = self.options.termination;
+        let (stop, table) = match &self.options.termination {
+            Termination::Fixed(stop) => (*stop, None),
+            Termination::Lut(lut) => (lut.also_fixed().unwrap_or(0.0), Some(reference_table(lut))),
+        };
         reference::Options {
             near: self.options.near.into(),
             alpha_max: self.options.alpha_max.into(),
             stop: stop.into(),
+            table,
             background: self.options.background.map(f64::from),
             sh_degree: self.options.sh_degree.unwrap_or(self.cloud.sh_degree),
             ..reference::Options::default()
@@ -257,6 +262,20 @@ impl Scene {
     /// The float64 reference of this scene.
     pub fn reference(&self) -> reference::Frame {
         reference::render(&self.reference_gaussians(), &self.reference_camera(), &self.reference_options())
+    }
+}
+
+fn reference_table(lut: &TerminationLut) -> reference::Table {
+    reference::Table {
+        size: lut.size(),
+        limits: lut.limits().iter().map(|&v| v.into()).collect(),
+        residual: match lut.residual() {
+            Residual::Drop => reference::TableResidual::Drop,
+            Residual::Background => reference::TableResidual::Background,
+            Residual::Mean => reference::TableResidual::Mean,
+            Residual::Centre => reference::TableResidual::Centre,
+        },
+        is_tile_bound: lut.color_max() == ColorMax::Tile,
     }
 }
 

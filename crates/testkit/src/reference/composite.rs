@@ -1,6 +1,6 @@
 //! Compositing of a frame, float64: tile lists, per-pixel loops, counters.
 
-use super::{ALPHA_MIN, Camera, Cutoff, Frame, Gaussians, Options, Projected, TILE, project};
+use super::{ALPHA_MIN, Camera, Cutoff, Frame, Gaussians, Options, Projected, TILE, Table, TableResidual, project};
 
 /// Renders the view and counts its work.
 pub fn render(gaussians: &Gaussians, camera: &Camera, options: &Options) -> Frame {
@@ -98,14 +98,19 @@ fn render_tile(
         }
     }
 
+    let channels = list.iter().flat_map(|p| p.color).chain(options.background);
+    let color_max = match &options.table {
+        Some(table) if table.is_tile_bound => channels.fold(1.0, f64::max),
+        _ => 1.0,
+    };
     let mut end = 0;
     let mut any_fragile = false;
     let mut blended_here = vec![false; list.len()];
     for row in rows {
         for column in columns.clone() {
             let pixel = row * camera.width + column;
-            let stop =
-                render_pixel(frame, &list, options, pixel, [column as f64 + 0.5, row as f64 + 0.5], &mut blended_here);
+            let center = [column as f64 + 0.5, row as f64 + 0.5];
+            let stop = render_pixel(frame, &list, options, color_max, pixel, center, &mut blended_here);
             end = end.max(stop);
             any_fragile |= frame.fragile[pixel];
         }
@@ -127,6 +132,7 @@ fn render_pixel(
     frame: &mut Frame,
     list: &[&Projected],
     options: &Options,
+    color_max: f64,
     pixel: usize,
     center: [f64; 2],
     blended_here: &mut [bool],
@@ -152,7 +158,12 @@ fn render_pixel(
         let alpha = raw.min(options.alpha_max);
         let next = transmittance * (1.0 - alpha);
         fragile |= near(next, options.stop, 10.0 * options.fragile_rel);
-        if next <= options.stop {
+        let (is_below, is_near) = match &options.table {
+            Some(table) => ask(table, transmittance * color_max, color, options.fragile_rel),
+            None => (false, false),
+        };
+        fragile |= is_near;
+        if next <= options.stop || is_below {
             stop = position;
             break;
         }
@@ -165,14 +176,42 @@ fn render_pixel(
         blended_here[position] = true;
         transmittance = next;
     }
+    let residual = match &options.table {
+        Some(table) if stop < list.len() => table.residual,
+        _ => TableResidual::Background,
+    };
     for (sum, b) in color.iter_mut().zip(options.background) {
-        *sum += transmittance * b;
+        *sum += transmittance
+            * match residual {
+                TableResidual::Drop => 0.0,
+                TableResidual::Background => b,
+                TableResidual::Mean if transmittance == 1.0 => 0.0,
+                TableResidual::Mean => *sum / (1.0 - transmittance),
+                TableResidual::Centre => color_max / 2.0,
+            };
     }
     (frame.color[pixel], frame.alpha[pixel], frame.depth[pixel]) = (color, 1.0 - transmittance, depth);
     frame.num_blended[pixel] = u32::try_from(weights.len()).expect("lists of tests are short");
     frame.fragile[pixel] = fragile;
     count(frame, &weights, &reached, fragile);
     stop
+}
+
+/// Whether a table stops a pixel of this colour with `left` = T·c_max, and whether float32 may decide otherwise.
+fn ask(table: &Table, left: f64, color: [f64; 3], fragile_rel: f64) -> (bool, bool) {
+    let largest = table.limits.iter().copied().fold(0.0, f64::max);
+    if left > largest * (1.0 + 10.0 * fragile_rel) {
+        return (false, false);
+    }
+    let size = table.size as f64;
+    let (mut at, mut is_near) = (0, false);
+    for channel in color {
+        let place = channel * size;
+        // Below 0 and above 1 there is no border.
+        is_near |= (place - place.round()).abs() < fragile_rel * size && place.round() > 0.0 && place.round() < size;
+        at = at * table.size + (place.clamp(0.0, size - 1.0)) as usize;
+    }
+    (left <= table.limits[at], is_near || near(left, table.limits[at], 10.0 * fragile_rel))
 }
 
 fn count(frame: &mut Frame, weights: &[(u32, f64)], reached: &[u32], fragile: bool) {

@@ -52,8 +52,34 @@ pub enum Cutoff {
     None,
 }
 
+/// What a pixel that a table stopped receives for the rest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TableResidual {
+    /// Nothing.
+    Drop,
+    /// T · background.
+    Background,
+    /// T · C / (1 − T).
+    Mean,
+    /// T · c_max / 2.
+    Centre,
+}
+
+/// A table of the transmittance at which each colour stops (JND).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Table {
+    /// Cells per axis.
+    pub size: usize,
+    /// Limits, γ included, `[size³]`, red slowest.
+    pub limits: Vec<f64>,
+    /// What becomes of the rest.
+    pub residual: TableResidual,
+    /// Whether hidden colours are bounded by the tile's largest channel instead of 1.
+    pub is_tile_bound: bool,
+}
+
 /// Parameters of a frame.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Options {
     /// Depths up to this are culled.
     pub near: f64,
@@ -61,6 +87,8 @@ pub struct Options {
     pub alpha_max: f64,
     /// A ray stops before the Gaussian that would take its transmittance to this or below.
     pub stop: f64,
+    /// The table a ray stops by too.
+    pub table: Option<Table>,
     /// Colour behind everything.
     pub background: [f64; 3],
     /// SH degree that is evaluated.
@@ -79,6 +107,7 @@ impl Default for Options {
             near: 0.01,
             alpha_max: 0.999,
             stop: 1e-4,
+            table: None,
             background: [0.0; 3],
             sh_degree: 0,
             antialiased: false,

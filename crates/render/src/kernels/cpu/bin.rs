@@ -63,8 +63,19 @@ pub struct TileLists<'a> {
     pub record_offsets: Cow<'a, [u32]>,
     /// Position of each record in the pair arrays, `[P]`: a permutation of 0..P. Empty unless asked for.
     pub record_pairs: Cow<'a, [u32]>,
+    /// Largest colour channel of each tile's splats, at least 0, `[tiles]`. Empty unless asked for.
+    pub color_max: Cow<'a, [f32]>,
     /// Pairs a test of bounding boxes would give.
     pub num_pairs_box: u64,
+}
+
+/// What is wanted beside the lists.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct BinExtras {
+    /// [`TileLists::record_pairs`], which only gradients need.
+    pub records: bool,
+    /// [`TileLists::color_max`], which only tables of termination need.
+    pub color_max: bool,
 }
 
 /// One splat in one row of tiles.
@@ -112,11 +123,11 @@ pub(super) fn split_at_offsets<T>(mut slice: &mut [T], ends: impl IntoIterator<I
 /// Splats handled by one task while spans are computed.
 const CHUNK: usize = 1024;
 
-/// Bins the splats of one view; `with_records` fills [`TileLists::record_pairs`], which only gradients need.
+/// Bins the splats of one view.
 ///
 /// # Errors
 /// [`Error::Limit`] if there are more pairs than indices.
-pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Result<TileLists<'static>> {
+pub fn bin(splats: &ProjectedSplats, grid: TileGrid, extras: BinExtras) -> Result<TileLists<'static>> {
     let rows = splats.rows();
     // 1. Rows of tiles per splat; one entry each.
     let tile_row_ranges: Vec<Range<u32>> = rows.par_iter().with_min_len(CHUNK).map(|s| tile_rows(s, &grid)).collect();
@@ -209,17 +220,28 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
     let splat_rows = split_at_offsets(&mut pair_splats, pair_ends);
     // Rows of tiles write interleaved records, each exactly once: atomics keep that safe and cost a plain store.
     let record_pairs: Vec<AtomicU32> =
-        (0..if with_records { num_pairs } else { 0 }).map(|_| AtomicU32::new(0)).collect();
-    row_lists.into_par_iter().zip(splat_rows).enumerate().for_each(|(row, (list, splats))| {
+        (0..if extras.records { num_pairs } else { 0 }).map(|_| AtomicU32::new(0)).collect();
+    let mut color_max = vec![0.0f32; if extras.color_max { grid.len() } else { 0 }];
+    let maxima = split_at_offsets(
+        &mut color_max,
+        (1..=grid.tiles_y as usize).map(|r| if extras.color_max { r * tiles_x } else { 0 }),
+    );
+    row_lists.into_par_iter().zip(splat_rows).zip(maxima).enumerate().for_each(|(row, ((list, splats), maxima))| {
         let starts = &tile_offsets[row * tiles_x..][..tiles_x];
         let mut cursors = starts.to_vec();
         for &e in list.iter() {
             let entry = entries[e as usize];
+            if extras.color_max {
+                let largest = rows[entry.splat as usize][lane::RED..lane::RED + 3].iter().copied().fold(0.0, f32::max);
+                for maximum in &mut maxima[entry.first_tile as usize..entry.end_tile.max(entry.first_tile) as usize] {
+                    *maximum = maximum.max(largest);
+                }
+            }
             for (record, tile) in (entry.record..).zip(entry.first_tile..entry.end_tile) {
                 let pair = cursors[tile as usize];
                 cursors[tile as usize] += 1;
                 splats[(pair - starts[0]) as usize] = entry.splat;
-                if with_records {
+                if extras.records {
                     record_pairs[record as usize].store(pair, Ordering::Relaxed);
                 }
             }
@@ -232,6 +254,7 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, with_records: bool) -> Resu
         pair_splats: pair_splats.into(),
         record_offsets: record_offsets.into(),
         record_pairs: record_pairs.into(),
+        color_max: color_max.into(),
         num_pairs_box,
     })
 }

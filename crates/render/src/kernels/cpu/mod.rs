@@ -5,6 +5,7 @@
 //! are the same bits on any number of threads.
 
 pub mod bin;
+pub mod lut;
 pub mod project;
 pub mod project_bwd;
 pub mod rasterize;

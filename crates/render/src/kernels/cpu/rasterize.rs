@@ -4,24 +4,33 @@
 //! sixteen pixels at a time. The state of the 256 pixels stays in the first-level cache. A pixel that has stopped
 //! keeps its transmittance with the sign flipped: the test "T(1−α) > T_stop" then fails for every later splat without
 //! a mask. A tile ends when all its pixels have stopped. Empty lists give the background.
+//!
+//! With a termination table a pixel also stops before a splat when its colour allows it (JND Sec. 3). The table is looked
+//! at for rows only in which some pixel has come within reach of its largest entry.
+//!
+//! A few lines over the aim: image, counters and table are one loop with options at compile time, not three copies.
 
 use super::bin::TileLists;
+use super::lut::{TileLut, below_limit, residual, tile_lut};
 use super::stats::{PairStats, StatsLevel};
 use super::tile::{BATCH, CENTERS, RasterSplat, Row, RowI, Staged, TileRect, raster_splats, stage};
 use crate::layout::{TILE, lane};
 use crate::math::alpha::LOG2_ALPHA_MIN;
 use crate::simd::{Kernel, LANES, Simd, dispatch};
 use crate::stats::RenderStats;
+use crate::termination::TerminationLut;
 use rayon::prelude::*;
 use std::borrow::Cow;
 
 /// Options of the rasterisers.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct RasterOptions {
     /// Clamp of α.
     pub alpha_max: f32,
     /// A pixel stops before the splat that would bring T to this or below.
     pub t_stop: f32,
+    /// Table by which a pixel stops too; never with the smoothed cut.
+    pub lut: Option<TerminationLut>,
     /// Colour behind everything.
     pub background: [f32; 3],
     /// Fifth channel Σ T α z.
@@ -103,13 +112,21 @@ pub fn rasterize(
         .zip(tile_stats.par_iter_mut())
         .map(|(((((tile_y, image), final_t), stop), tile_ends), pair_stats)| {
             let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats };
+            if options.lut.is_some() {
+                return match (level, options.depth) {
+                    (StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, true>(strip)),
+                    (StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, true>(strip)),
+                    (StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, true>(strip)),
+                    (StatsLevel::None, true) => dispatch(ForwardStrip::<true, 0, false, true>(strip)),
+                };
+            }
             match (level, options.depth, options.smooth_cutoff) {
-                (StatsLevel::Dominance, ..) => dispatch(ForwardStrip::<false, 1, false>(strip)),
-                (StatsLevel::All, ..) => dispatch(ForwardStrip::<false, 2, false>(strip)),
-                (StatsLevel::None, false, false) => dispatch(ForwardStrip::<false, 0, false>(strip)),
-                (StatsLevel::None, true, false) => dispatch(ForwardStrip::<true, 0, false>(strip)),
-                (StatsLevel::None, false, true) => dispatch(ForwardStrip::<false, 0, true>(strip)),
-                (StatsLevel::None, true, true) => dispatch(ForwardStrip::<true, 0, true>(strip)),
+                (StatsLevel::Dominance, ..) => dispatch(ForwardStrip::<false, 1, false, false>(strip)),
+                (StatsLevel::All, ..) => dispatch(ForwardStrip::<false, 2, false, false>(strip)),
+                (StatsLevel::None, false, false) => dispatch(ForwardStrip::<false, 0, false, false>(strip)),
+                (StatsLevel::None, true, false) => dispatch(ForwardStrip::<true, 0, false, false>(strip)),
+                (StatsLevel::None, false, true) => dispatch(ForwardStrip::<false, 0, true, false>(strip)),
+                (StatsLevel::None, true, true) => dispatch(ForwardStrip::<true, 0, true, false>(strip)),
             }
         })
         .collect::<Vec<RenderStats>>();
@@ -151,10 +168,13 @@ struct Strip<'a> {
     pair_stats: &'a mut Vec<PairStats>,
 }
 
-/// The forward kernel. `STATS`: 0 = image, 1 = dominance counters, 2 = all counters; counters replace the image.
-struct ForwardStrip<'a, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(Strip<'a>);
+/// The forward kernel. `STATS`: 0 = image, 1 = dominance counters, 2 = all counters; counters replace the image. `LUT`:
+/// with a termination table.
+struct ForwardStrip<'a, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool>(Strip<'a>);
 
-impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardStrip<'_, DEPTH, STATS, SMOOTH> {
+impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Kernel
+    for ForwardStrip<'_, DEPTH, STATS, SMOOTH, LUT>
+{
     type Output = RenderStats;
 
     #[inline(always)]
@@ -169,7 +189,9 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
             let pairs = lists.tile_offsets[id] as usize..lists.tile_offsets[id + 1] as usize;
             stats.num_tiles_empty += u64::from(pairs.is_empty());
             let list = &lists.pair_splats[pairs];
+            let lut = tile_lut(options, lists, id);
             let mut rows = [FRESH; TILE];
+            let mut lines = [lut.first_line(); TILE];
             let outside = s.and_not(s.mask(u16::MAX), s.mask(tile.lane_bits()));
             for row in &mut rows[..tile.height] {
                 s.store(s.select(outside, s.splat(-1.0), s.splat(1.0)), &mut row.t.0);
@@ -186,8 +208,16 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
                     for (k, splat) in chunk.iter().enumerate() {
                         let index = batch * BATCH + part * CHECK + k;
                         let counters = pair_stats.get_mut(first_pair + index);
-                        let num_rows =
-                            composite::<S, DEPTH, STATS, SMOOTH>(s, splat, index as i32, &mut rows, options, counters);
+                        let num_rows = composite::<S, DEPTH, STATS, SMOOTH, LUT>(
+                            s,
+                            splat,
+                            index as i32,
+                            &mut rows,
+                            options,
+                            lut,
+                            &mut lines,
+                            counters,
+                        );
                         stats.num_lane_pixels += (num_rows * LANES) as u64;
                     }
                     alive = any_alive(s, &rows[..tile.height]);
@@ -213,7 +243,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
                     stats.num_blended += counters.iter().map(|c| u64::from(c.pixels_blended)).sum::<u64>();
                 }
             } else {
-                write_colors::<S, DEPTH>(s, &rows, &tile, width, options, image);
+                write_colors::<S, DEPTH, LUT>(s, &rows, &tile, width, options, lut, image);
             }
             if !final_t.is_empty() {
                 for (y, row) in rows[..tile.height].iter().enumerate() {
@@ -230,13 +260,16 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool> Kernel for ForwardS
 }
 
 /// Blends one splat into the rows it reaches. Returns the number of rows visited.
+#[expect(clippy::too_many_arguments, reason = "the state of the loop, passed in registers")]
 #[inline(always)]
-fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
+fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool>(
     s: S,
     g: &Staged,
     index: i32,
     rows: &mut [PixelRow; TILE],
     options: &RasterOptions,
+    lut: TileLut<'_>,
+    lines: &mut [Row; TILE],
     counters: Option<&mut PairStats>,
 ) -> usize {
     let (first, end) = (g.first_row as usize, (g.end_row as usize).min(TILE));
@@ -254,6 +287,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
     let t_stop = s.splat(options.t_stop);
     let (zero, position) = (s.splat(0.0), s.splat_i(index));
     let (mut num_blended, mut weight_max, mut weight_sum) = (0, s.splat(0.0), s.splat(0.0));
+    let mut y = first;
     for (row, center) in rows[first..end].iter_mut().zip(&CENTERS[first..end]) {
         let dy = s.splat(center - g.mean_y);
         let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
@@ -267,19 +301,24 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool>(
         let t = s.load(&row.t.0);
         let t_next = s.fnma(alpha, t, t);
         // Kerbl 2023, App. C: stop before the splat that would end the pixel.
-        let blended = s.gt_where(hit, t_next, t_stop);
+        let mut blended = s.gt_where(hit, t_next, t_stop);
+        if LUT {
+            blended = s.and_not(blended, below_limit(s, lut, hit, t, &row.channels, &mut lines[y]));
+            y += 1;
+        }
         let weight = s.mul_where(blended, alpha, t);
         // No branch: in a dense tile some pixel stops at almost every splat.
         let now = s.gt_where(s.and_not(hit, blended), t, zero);
         let t_new = s.select(blended, t_next, t);
         s.store(s.select(now, s.neg_abs(t), t_new), &mut row.t.0);
         s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
-        if STATS == 0 {
+        if STATS == 0 || LUT {
             let num = if DEPTH { 4 } else { 3 };
             for (sum, channel) in row.channels[..num].iter_mut().zip(channels) {
                 s.store(s.fma(weight, channel, s.load(&sum.0)), &mut sum.0);
             }
-        } else {
+        }
+        if STATS > 0 {
             let best = s.load(&row.best.0);
             let better = s.gt_where(blended, weight, best);
             s.store(s.select(better, weight, best), &mut row.best.0);
@@ -331,21 +370,28 @@ fn last_stop(rows: &[PixelRow; TILE], tile: &TileRect) -> usize {
 
 /// Writes a tile's pixels: colour over the background, 1 − T, and depth.
 #[inline(always)]
-fn write_colors<S: Simd, const DEPTH: bool>(
+fn write_colors<S: Simd, const DEPTH: bool, const LUT: bool>(
     s: S,
     rows: &[PixelRow; TILE],
     tile: &TileRect,
     width: usize,
     options: &RasterOptions,
+    lut: TileLut<'_>,
     image: &mut [f32],
 ) {
     let num = if DEPTH { 5 } else { 4 };
     let background = options.background.map(|b| s.splat(b));
     for (y, row) in rows[..tile.height].iter().enumerate() {
-        let t = s.abs(s.load(&row.t.0));
+        let signed = s.load(&row.t.0);
+        let t = s.abs(signed);
         let mut planes = [[0.0; LANES]; 5];
         for ((plane, channel), b) in planes.iter_mut().zip(&row.channels).zip(background) {
-            s.store(s.fma(t, b, s.load(&channel.0)), plane);
+            let color = s.load(&channel.0);
+            let mut rest = b;
+            if LUT {
+                rest = s.select(s.gt(signed, s.splat(0.0)), b, residual(s, lut, t, color, b));
+            }
+            s.store(s.fma(t, rest, color), plane);
         }
         s.store(s.sub(s.splat(1.0), t), &mut planes[3]);
         planes[4] = row.channels[3].0;

@@ -22,6 +22,9 @@ use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
+/// Most tiles of an image: 256 splats that reach all of them still have less than 2³² pairs.
+const MAX_TILES: usize = (1 << 24) - 1;
+
 /// Places in the buffer of counters that is read back.
 mod counter {
     /// Visible splats V.
@@ -48,6 +51,8 @@ pub struct TileLists {
     pub tile_offsets: CubeTensor,
     /// Splat and record of each pair, `[P, 2]`.
     pub pairs: CubeTensor,
+    /// Bits of the largest colour channel of each tile's splats, at least 0, `[tiles]`. Empty unless asked for.
+    pub color_max: CubeTensor,
     /// First record of each splat, `[V + 1]` or longer.
     pub record_offsets: CubeTensor,
     /// Number of splats V.
@@ -60,14 +65,23 @@ pub struct TileLists {
     pub num_non_finite: u64,
 }
 
-/// Builds the lists of all tiles.
+/// Builds the lists of all tiles; `wants_maximum` fills [`TileLists::color_max`].
 ///
 /// # Errors
 /// [`Error::Limit`] if there are more pairs than indices, or a buffer would be larger than the adapter takes;
 /// [`Error::Device`] when the adapter does not answer.
-pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid) -> Result<TileLists> {
+pub fn bin(
+    gpu: &Gpu,
+    g: &GaussianBuffers,
+    projected: &Projected,
+    grid: TileGrid,
+    wants_maximum: bool,
+) -> Result<TileLists> {
     let n = g.len;
     let Projected { lanes, visible_offsets } = projected;
+    if grid.len() > MAX_TILES {
+        return Err(Error::Limit { what: "tiles of an image", needed: grid.len() as u64, limit: MAX_TILES as u64 });
+    }
     let counters = gpu.zeros("bytes of counters", &[counter::COUNT], DType::U32)?;
     // 1. The visible splats, front to back.
     let keys = gpu.empty("bytes of sort keys", &[n], DType::U32)?;
@@ -135,12 +149,15 @@ pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid
             grid.tiles_y as f32,
         );
     }
-    let tile_bits = usize::BITS - grid.len().saturating_sub(1).leading_zeros();
+    // One number more than there are tiles: see `emit`.
+    let tile_bits = usize::BITS - grid.len().leading_zeros();
     let (pair_tiles, pair_records) =
         radix_sort(gpu, pair_tiles, pair_records, num_pairs, &record_offsets, n, tile_bits)?;
     // 5. Lists: where each tile's begins, and what stands in them.
     let tile_offsets = gpu.zeros("bytes of tile offsets", &[grid.len() + 1], DType::U32)?;
     let pairs = gpu.empty("bytes of pairs", &[num_pairs, 2], DType::U32)?;
+    let num_maxima = if wants_maximum { grid.len() } else { 0 };
+    let color_max = gpu.zeros("bytes of tile maxima", &[num_maxima], DType::U32)?;
     if num_pairs > 0 {
         list_pairs::launch(
             &gpu.client,
@@ -151,8 +168,11 @@ pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid
             pair_splats.into_buffer_arg(),
             pairs.clone().into_buffer_arg(),
             tile_offsets.clone().into_buffer_arg(),
+            compact_lanes.clone().into_buffer_arg(),
+            color_max.clone().into_buffer_arg(),
             num_pairs as u32,
             grid.len() as u32,
+            wants_maximum,
         );
     }
     Ok(TileLists {
@@ -161,6 +181,7 @@ pub fn bin(gpu: &Gpu, g: &GaussianBuffers, projected: &Projected, grid: TileGrid
         global_from_compact,
         tile_offsets,
         pairs,
+        color_max,
         record_offsets,
         num_visible,
         num_pairs,
@@ -268,7 +289,7 @@ fn count_tiles(
         num_tiles[r] = count;
     }
     sync_cube();
-    // The sum of 256 splats fits 32 bits (an image has less than 2²⁴ tiles); a wrapped low word carries.
+    // The sum of 256 splats fits 32 bits: an image has at most MAX_TILES tiles. A wrapped low word carries.
     if UNIT_POS < 2 {
         let sum = sums[UNIT_POS as usize].load();
         let low = (UNIT_POS * 2) as usize + counter::PAIRS;
@@ -320,9 +341,9 @@ fn emit(
                 }
             }
         }
-        // For the same reason none may stay unwritten; a pair of a tile that the splat does not reach blends nothing.
+        // For the same reason none may stay unwritten: they go behind the last tile, into no list.
         while record < end {
-            pair_tiles[record as usize] = 0u32;
+            pair_tiles[record as usize] = u32::cast_from(tiles_x) * u32::cast_from(tiles_y);
             pair_splats[record as usize] = r as u32;
             pair_records[record as usize] = record;
             record += 1u32;
@@ -330,7 +351,7 @@ fn emit(
     }
 }
 
-/// Splat and record of each pair in list order, and the start of each tile's list.
+/// Splat and record of each pair in list order, the start of each tile's list, and the largest channel in it.
 #[cube(launch)]
 fn list_pairs(
     pair_tiles: &[u32],
@@ -338,16 +359,28 @@ fn list_pairs(
     pair_splats: &[u32],
     pairs: &mut [u32],
     tile_offsets: &mut [u32],
+    lanes: &[f32],
+    color_max: &[Atomic<u32>],
     num_pairs: u32,
     num_tiles: u32,
+    #[comptime] wants_maximum: bool,
 ) {
     let p = ABSOLUTE_POS;
     if p < num_pairs as usize {
         let record = pair_records[p];
         pairs[p * 2] = pair_splats[record as usize];
         pairs[p * 2 + 1] = record;
-        // A list begins behind the last pair of an earlier tile; tiles between two pairs are empty.
+        // A list begins behind the last pair of an earlier tile; tiles between two pairs are empty. The number behind the
+        // last tile ends the last list.
         let tile = pair_tiles[p];
+        if comptime!(wants_maximum) {
+            let at = pair_splats[record as usize] as usize * lane::COUNT + lane::RED;
+            let largest = f32::max(f32::max(lanes[at], lanes[at + 1]), lanes[at + 2]);
+            // The bits of positive floats order like the floats. Most splats stay below 1, which counts anyway.
+            if largest > 1.0_f32 {
+                color_max[tile as usize].fetch_max(u32::reinterpret(largest));
+            }
+        }
         let mut first = 0u32;
         if p > 0 {
             first = pair_tiles[p - 1] + 1;

@@ -5,6 +5,7 @@
 //! on every run. No kernel depends on the size of a subgroup.
 
 pub mod bin;
+pub mod lut;
 pub mod project;
 pub mod project_bwd;
 pub mod rasterize;

@@ -3,8 +3,12 @@
 //! One workgroup per tile, one unit per pixel; splats are staged in batches in workgroup memory. A tile ends when all
 //! its pixels have stopped. Empty lists give the background; pixels of the last tiles that lie outside the image have
 //! stopped from the start.
+//!
+//! With a termination table a pixel also stops before a splat when its colour allows it (JND Sec. 3): a kernel of its own,
+//! because none may bind more buffers. What both do is one device function.
 
 use super::bin::TileLists;
+use super::lut::{LutUse, below_limit, limits, residual, tile_lut};
 use super::tile::{STAGED, StagedSplat, TileArgs, pixel, stage, staged_splat, tile_args};
 use crate::error::Result;
 use crate::gpu::{Gpu, UNITS, cube_dim};
@@ -32,7 +36,7 @@ pub struct Raster {
     pub tile_ends: CubeTensor,
 }
 
-/// Composites all tiles; `keep` keeps what the backward pass needs.
+/// Composites all tiles; `keep` keeps what the backward pass needs, for which there is no table.
 ///
 /// # Errors
 /// [`crate::Error::Limit`] when a buffer is larger than the adapter takes.
@@ -44,6 +48,24 @@ pub fn rasterize(gpu: &Gpu, lists: &TileLists, options: &RasterOptions, keep: bo
     let final_t = gpu.empty("bytes of the image", &kept, DType::F32)?;
     let stop = gpu.empty("bytes of the image", &kept, DType::U32)?;
     let tile_ends = gpu.empty("bytes of tile ends", &[grid.len()], DType::U32)?;
+    if let Some(lut) = &options.lut {
+        rasterize_lut_kernel::launch(
+            &gpu.client,
+            gpu.cubes(grid.len()),
+            cube_dim(),
+            lists.lanes.clone().into_buffer_arg(),
+            lists.tile_offsets.clone().into_buffer_arg(),
+            lists.pairs.clone().into_buffer_arg(),
+            limits(gpu, lut).into_buffer_arg(),
+            lists.color_max.clone().into_buffer_arg(),
+            image.clone().into_buffer_arg(),
+            tile_ends.clone().into_buffer_arg(),
+            tile_args(grid, options),
+            options.depth,
+            LutUse::of(options),
+        );
+        return Ok(Raster { image, final_t, stop, tile_ends });
+    }
     rasterize_kernel::launch(
         &gpu.client,
         gpu.cubes(grid.len()),
@@ -95,7 +117,20 @@ pub fn alpha_at(s: StagedSplat, x: f32, y: f32, #[comptime] smooth: bool) -> Alp
     Alpha { is_hit, full, slope }
 }
 
-/// The forward kernel.
+/// A pixel when its tile has ended.
+#[derive(CubeType, Clone, Copy)]
+struct PixelEnd {
+    /// Row-major index in the image.
+    index: u32,
+    /// Whether the pixel lies in the image.
+    is_inside: bool,
+    /// Transmittance left.
+    t: f32,
+    /// List position at which it stopped; [`NEVER`] if it did not.
+    stopped_at: u32,
+}
+
+/// The forward kernel. `keep`: fills what the backward pass needs.
 #[cube(launch)]
 fn rasterize_kernel(
     lanes: &[f32],
@@ -110,14 +145,62 @@ fn rasterize_kernel(
     #[comptime] smooth: bool,
     #[comptime] keep: bool,
 ) {
+    if CUBE_POS >= args.num_tiles as usize {
+        terminate!();
+    }
+    // Without a table the two buffers that belong to it are never read.
+    let none = comptime!(None);
+    let end = composite(lanes, tile_offsets, pairs, lanes, tile_offsets, image, tile_ends, &args, depth, smooth, none);
+    if comptime!(keep) {
+        let pixel = end.index as usize;
+        if end.is_inside {
+            final_t[pixel] = end.t;
+            stop[pixel] = end.stopped_at;
+        }
+    }
+}
+
+/// The forward kernel with a termination table.
+#[cube(launch)]
+fn rasterize_lut_kernel(
+    lanes: &[f32],
+    tile_offsets: &[u32],
+    pairs: &[u32],
+    limits: &[f32],
+    color_max: &[u32],
+    image: &mut [f32],
+    tile_ends: &mut [u32],
+    args: TileArgs,
+    #[comptime] depth: bool,
+    #[comptime] lut: Option<LutUse>,
+) {
+    if CUBE_POS >= args.num_tiles as usize {
+        terminate!();
+    }
+    composite(lanes, tile_offsets, pairs, limits, color_max, image, tile_ends, &args, depth, false, lut);
+}
+
+/// Composites the tile of this workgroup and writes its pixels.
+#[cube]
+fn composite(
+    lanes: &[f32],
+    tile_offsets: &[u32],
+    pairs: &[u32],
+    limits: &[f32],
+    color_max: &[u32],
+    image: &mut [f32],
+    tile_ends: &mut [u32],
+    args: &TileArgs,
+    #[comptime] depth: bool,
+    #[comptime] smooth: bool,
+    #[comptime] lut: Option<LutUse>,
+) -> PixelEnd {
     let mut staged = Shared::<[f32]>::new_slice(STAGED * BATCH);
     // Pixels that have not stopped; list position at which the last of them did.
     let votes = Shared::<[Atomic<u32>]>::new_slice(2usize);
+    let table = tile_lut(limits, color_max, args, lut);
     let tile = CUBE_POS;
-    if tile >= args.num_tiles as usize {
-        terminate!();
-    }
-    let p = pixel(&args, tile as u32);
+    let p = pixel(args, tile as u32);
     let start = tile_offsets[tile];
     let len = tile_offsets[tile + 1] - start;
     let mut t = 1.0_f32;
@@ -146,8 +229,12 @@ fn rasterize_kernel(
             if alpha.is_hit {
                 let alpha = f32::min(alpha.full, args.alpha_max);
                 let t_next = t - alpha * t;
+                let mut is_blended = t_next > args.t_stop;
+                if comptime!(lut.is_some()) {
+                    is_blended = is_blended && !below_limit(&table, limits, args, t, red, green, blue, lut);
+                }
                 // Kerbl 2023, App. C: stop before the splat that would end the pixel.
-                if t_next > args.t_stop {
+                if is_blended {
                     let weight = alpha * t;
                     red += weight * staged[6 * BATCH + slot];
                     green += weight * staged[7 * BATCH + slot];
@@ -186,16 +273,24 @@ fn rasterize_kernel(
     if p.is_inside {
         let pixel = p.index as usize;
         let channels = comptime!(if depth { 5usize } else { 4usize });
-        image[pixel * channels] = red + t * args.background_r;
-        image[pixel * channels + 1] = green + t * args.background_g;
-        image[pixel * channels + 2] = blue + t * args.background_b;
+        let mut rest_r = args.background_r;
+        let mut rest_g = args.background_g;
+        let mut rest_b = args.background_b;
+        if comptime!(lut.is_some()) {
+            // A pixel that worked through its list sees the background, whatever the table.
+            if stopped_at != NEVER {
+                rest_r = residual(&table, t, red, rest_r, lut);
+                rest_g = residual(&table, t, green, rest_g, lut);
+                rest_b = residual(&table, t, blue, rest_b, lut);
+            }
+        }
+        image[pixel * channels] = red + t * rest_r;
+        image[pixel * channels + 1] = green + t * rest_g;
+        image[pixel * channels + 2] = blue + t * rest_b;
         image[pixel * channels + 3] = 1.0_f32 - t;
         if comptime!(depth) {
             image[pixel * channels + 4] = depth_sum;
         }
-        if comptime!(keep) {
-            final_t[pixel] = t;
-            stop[pixel] = stopped_at;
-        }
     }
+    PixelEnd { index: p.index, is_inside: p.is_inside, t, stopped_at }
 }

@@ -2,9 +2,11 @@
 //!
 //! A pass of its own composites every tile again: in batches of eight splats, pixels leave the weights they blend in
 //! workgroup memory, and 32 units per splat sum, count and take the largest. Every pair has its own counters, which are
-//! then summed per splat, one unit each. All sums are integers or have a fixed order, and all maxima are exact.
+//! then summed per splat, one unit each. All sums are integers or have a fixed order, and all maxima are exact. Counters go
+//! to the host, so a frame that is asked for them reads back twice: the number of pairs, and here.
 
 use super::bin::TileLists;
+use super::lut::{LutUse, below_limit, limits, tile_lut};
 use super::rasterize::alpha_at;
 use super::tile::{STAGED, TileArgs, pixel, stage, staged_splat, tile_args};
 use crate::error::Result;
@@ -82,10 +84,8 @@ pub fn splat_stats(
     if mode == StatsMode::None {
         return Ok((out, 0));
     }
-    let offsets = gpu.read_u32(&lists.tile_offsets)?;
-    let num_empty = offsets.windows(2).filter(|w| w[0] == w[1]).count() as u64;
     if lists.num_pairs == 0 {
-        return Ok((out, num_empty));
+        return Ok((out, lists.grid.len() as u64));
     }
     let counters = gpu.zeros("bytes of pair counters", &[lists.num_pairs, pair_word::COUNT], DType::U32)?;
     count_pairs::launch(
@@ -96,9 +96,16 @@ pub fn splat_stats(
         lists.tile_offsets.clone().into_buffer_arg(),
         lists.pairs.clone().into_buffer_arg(),
         tile_ends.clone().into_buffer_arg(),
+        match &options.lut {
+            Some(lut) => limits(gpu, lut).into_buffer_arg(),
+            // Never read without a table.
+            None => lists.lanes.clone().into_buffer_arg(),
+        },
+        lists.color_max.clone().into_buffer_arg(),
         counters.clone().into_buffer_arg(),
         tile_args(&lists.grid, options),
         mode >= StatsMode::Dominance,
+        LutUse::of(options),
     );
     let per_splat = gpu.empty("bytes of splat counters", &[lists.num_visible, splat_word::COUNT], DType::U32)?;
     sum_counters::launch(
@@ -110,8 +117,8 @@ pub fn splat_stats(
         per_splat.clone().into_buffer_arg(),
         lists.num_visible as u32,
     );
-    let words = gpu.read_u32(&per_splat)?;
-    let ids = gpu.read_u32(&lists.global_from_compact)?;
+    let [words, ids, offsets] = gpu.read_all_u32([&per_splat, &lists.global_from_compact, &lists.tile_offsets])?;
+    let num_empty = offsets.windows(2).filter(|w| w[0] == w[1]).count() as u64;
     for (row, &id) in words.chunks_exact(splat_word::COUNT).zip(&ids) {
         let i = id as usize;
         out.tiles_used[i] = row[splat_word::USED];
@@ -136,9 +143,12 @@ fn count_pairs(
     tile_offsets: &[u32],
     pairs: &[u32],
     tile_ends: &[u32],
+    limits: &[f32],
+    color_max: &[u32],
     counters: &[Atomic<u32>],
     args: TileArgs,
     #[comptime] pixels: bool,
+    #[comptime] lut: Option<LutUse>,
 ) {
     let units = UNITS as usize;
     let unit = UNIT_POS as usize;
@@ -160,7 +170,11 @@ fn count_pairs(
         counters[record * pair_word::COUNT + pair_word::USED].store(1u32);
     }
     if comptime!(pixels) {
+        let table = tile_lut(limits, color_max, &args, lut);
         let mut t = 1.0_f32;
+        let mut red = 0.0_f32;
+        let mut green = 0.0_f32;
+        let mut blue = 0.0_f32;
         let mut is_done = !p.is_inside;
         let mut best = 0.0_f32;
         let mut best_at = end;
@@ -181,8 +195,17 @@ fn count_pairs(
                     if alpha.is_hit {
                         let alpha = f32::min(alpha.full, args.alpha_max);
                         let t_next = t - alpha * t;
-                        if t_next > args.t_stop {
+                        let mut is_blended = t_next > args.t_stop;
+                        if comptime!(lut.is_some()) {
+                            is_blended = is_blended && !below_limit(&table, limits, &args, t, red, green, blue, lut);
+                        }
+                        if is_blended {
                             weight = alpha * t;
+                            if comptime!(lut.is_some()) {
+                                red += weight * staged[6 * BATCH + slot];
+                                green += weight * staged[7 * BATCH + slot];
+                                blue += weight * staged[8 * BATCH + slot];
+                            }
                             t = t_next;
                             // The nearer wins a tie.
                             if weight > best {
@@ -208,7 +231,7 @@ fn count_pairs(
                     let weight = weights[k * units + q * UNITS_PER_SPLAT + part];
                     sum += weight;
                     largest = f32::max(largest, weight);
-                    // A weight is never 0 where something is blended: α ≥ 1/255 and T above the stop.
+                    // A weight is never 0 where something is blended: α ≥ 1/255 and T above the stop or the limit.
                     if weight > 0.0_f32 {
                         number += 1.0_f32;
                     }

@@ -7,6 +7,7 @@ use crate::kernels::cpu::bin::TileGrid;
 use crate::layout::{TILE, lane};
 use crate::math::alpha::log2_conic;
 use crate::math::vec::Sym2;
+use crate::termination::ColorMax;
 use cubecl::prelude::*;
 
 const _: () = assert!(TILE * TILE == UNITS as usize, "one unit per pixel of a tile");
@@ -29,6 +30,12 @@ pub struct TileArgs {
     pub alpha_max: f32,
     /// A pixel stops before the splat that would bring T to this or below.
     pub t_stop: f32,
+    /// Cells of the termination table along each axis; 0 without one.
+    pub lut_size: u32,
+    /// Its largest limit.
+    pub lut_largest: f32,
+    /// Bound of the hidden channels before those of the tile's splats are looked at: 1, and with the tile's the background.
+    pub color_max: f32,
     /// Background, red.
     pub background_r: f32,
     /// Background, green.
@@ -40,8 +47,27 @@ pub struct TileArgs {
 /// The arguments for an image.
 pub fn tile_args(grid: &TileGrid, options: &crate::kernels::cpu::rasterize::RasterOptions) -> TileArgsLaunch {
     let [r, g, b] = options.background;
-    let num_tiles = grid.len() as u32;
-    TileArgsLaunch::new(grid.width, grid.height, grid.tiles_x, num_tiles, options.alpha_max, options.t_stop, r, g, b)
+    let (mut lut_size, mut lut_largest, mut color_max) = (0, 0.0, 1.0);
+    if let Some(lut) = &options.lut {
+        (lut_size, lut_largest) = (lut.size() as u32, lut.largest_limit());
+        if lut.color_max() == ColorMax::Tile {
+            color_max = options.background.iter().copied().fold(1.0, f32::max);
+        }
+    }
+    TileArgsLaunch::new(
+        grid.width,
+        grid.height,
+        grid.tiles_x,
+        grid.len() as u32,
+        options.alpha_max,
+        options.t_stop,
+        lut_size,
+        lut_largest,
+        color_max,
+        r,
+        g,
+        b,
+    )
 }
 
 /// The pixel of a unit.

@@ -2,6 +2,15 @@
 //!
 //! Images, SH colours and losses of this project are sRGB-encoded, as in Kerbl 2023; linear light appears only where
 //! light is added physically (the synthetic scenes, vision models).
+//!
+//! The modules below are colour science in `f64`: tristimulus values ([`xyz`]), CIE Lab ([`lab`]), the colour difference
+//! ΔE₀₀ ([`ciede2000`]) with its metric tensor in closed form ([`metric`]), cones and opponent axes ([`cones`]).
+
+pub mod ciede2000;
+pub mod cones;
+pub mod lab;
+pub mod metric;
+pub mod xyz;
 
 use serde::{Deserialize, Serialize};
 

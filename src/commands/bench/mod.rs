@@ -1,0 +1,35 @@
+//! `gazesplat bench`: what a part of the program gains and costs, one file per study.
+
+pub mod termination;
+
+use crate::console::Console;
+use crate::diagnostics::Result;
+use clap::{Args, Subcommand};
+
+/// Arguments of `bench`.
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Examples:
+  gazesplat bench termination model.ply --scene fox --out study")]
+pub struct BenchArgs {
+    /// What to measure
+    #[command(subcommand)]
+    pub study: Study,
+}
+
+/// The studies.
+#[derive(Debug, Subcommand)]
+pub enum Study {
+    /// Error against time of every termination rule: fixed, naive, and the tables at several γ
+    Termination(termination::StudyArgs),
+}
+
+/// Runs `bench`.
+///
+/// # Errors
+/// Whatever the study fails with.
+pub fn command(args: &BenchArgs, console: &Console) -> Result<()> {
+    match &args.study {
+        Study::Termination(args) => termination::command(args, console),
+    }
+}

@@ -1,0 +1,125 @@
+//! `lut`, `bench termination`, and the options of `render` and `eval` that go with them.
+
+use crate::support::Place;
+use std::fs;
+
+/// A quick table in `table.json`.
+fn with_table(place: Place) -> Place {
+    place.run(&["lut", "--rule", "vertex", "--sample", "centre", "--out", "table.json"]).done();
+    place
+}
+
+#[test]
+fn table_is_written_with_its_provenance_range_and_picture() {
+    let place = Place::new();
+    let ended = place.run(&["lut", "--preset", "paper", "--out", "paper.json"]).done();
+    assert_eq!(place.list("."), ["paper.json", "paper.png"]);
+    let said: serde_json::Value = serde_json::from_str(&ended.stdout).expect("JSON");
+    // The published range and cubic mean of this choice.
+    let number = |key: &str| said["range"][key].as_f64().expect("a number");
+    assert!((number("min") - 3.66e-4).abs() < 1e-6 && (number("max") - 1.0209e-2).abs() < 1e-6, "{said}");
+    assert!((number("cubic_mean") - 5.063e-3).abs() < 1e-6, "{said}");
+    let file: serde_json::Value = serde_json::from_str(&place.read("paper.json")).expect("JSON");
+    assert_eq!(file["values"].as_array().map(Vec::len), Some(512));
+    assert_eq!(file["spec"]["rule"], "dkl_diagonal");
+}
+
+#[test]
+fn tables_out_of_range_are_refused() {
+    let place = Place::new();
+    for option in [["--size", "0"], ["--size", "65"], ["--jnd-de", "0"], ["--jnd-de", "-1"], ["--jnd-de", "NaN"]] {
+        place.run(&["lut", option[0], option[1], "--out", "table.json"]).refused();
+    }
+    place.run(&["lut", "--out", "table.png"]).refused();
+    assert!(place.list(".").is_empty());
+}
+
+#[test]
+fn frames_stop_by_each_rule_and_blend_less() {
+    let place = with_table(Place::with_run());
+    let blended = |args: &[&str]| -> u64 {
+        let base = ["render", "run", "--scene", "scene", "--split", "test", "--stats", "--out", "frames"];
+        let said: serde_json::Value =
+            serde_json::from_str(&place.run(&[&base, args].concat()).done().stdout).expect("JSON");
+        said["views"].as_array().expect("views").iter().map(|v| v["num_blended"].as_u64().expect("a count")).sum()
+    };
+    let fixed = blended(&[]);
+    assert_eq!(fixed, blended(&["--termination", "fixed"]));
+    let table = blended(&["--lut", "table.json"]);
+    assert_eq!(table, blended(&["--termination", "jnd", "--lut", "table.json", "--gamma", "1"]));
+    assert!(table <= fixed && blended(&["--lut", "table.json", "--gamma", "10"]) <= table);
+    assert!(blended(&["--termination", "naive", "--lut", "table.json", "--gamma", "10"]) <= fixed);
+    let eval = |args: &[&str]| {
+        let base = ["eval", "run", "--scene", "scene"];
+        let said: serde_json::Value =
+            serde_json::from_str(&place.run(&[&base, args].concat()).done().stdout).expect("JSON");
+        said["psnr"].as_f64().expect("a number")
+    };
+    assert!((eval(&[]) - eval(&["--lut", "table.json"])).abs() < 0.2);
+}
+
+/// Every case ends before anything is drawn, with the reason.
+#[test]
+fn tables_and_gammas_that_cannot_be_used_are_refused_with_the_reason() {
+    let place = with_table(Place::with_run());
+    let whole = place.read("table.json");
+    let first = whole.split("\"values\": [").nth(1).and_then(|v| v.trim().split(',').next()).expect("values");
+    let cases = [
+        ("size.json", whole.replacen("\"size\": 8", "\"size\": 7", 1), "512 entries"),
+        ("nan.json", whole.replacen(first, "NaN", 1), "nan.json"),
+        ("zero.json", whole.replacen(first, "0.0", 1), "0 at entry 0"),
+        ("negative.json", whole.replacen(first, "-0.01", 1), "-0.01 at entry 0"),
+        ("linear.json", whole.replacen("\"read_as\": \"srgb\"", "\"read_as\": \"linear\"", 1), "linear light"),
+        ("empty.json", String::new(), "empty.json"),
+        ("other.json", "{\"a\": 1}".to_owned(), "other.json"),
+    ];
+    let render = ["render", "run", "--scene", "scene", "--out", "frames"];
+    for (name, text, reason) in &cases {
+        assert_ne!(*text, whole, "{name}");
+        place.write(name, text);
+        for command in [&render[..], &["eval", "run", "--scene", "scene"]] {
+            let said = place.run(&[command, &["--lut", name]].concat()).refused();
+            assert!(said.contains(name) && said.contains(reason), "{said}");
+        }
+    }
+    for (args, reason) in [
+        (&["--lut", "missing.json"][..], "missing.json"),
+        (&["--termination", "jnd", "--gamma", "-1"], "--gamma -1"),
+        (&["--termination", "jnd", "--gamma", "NaN"], "--gamma NaN"),
+        (&["--termination", "fixed", "--lut", "table.json"], "--lut"),
+        (&["--gamma", "2"], "--gamma"),
+    ] {
+        let said = place.run(&[&render[..], args].concat()).refused();
+        assert!(said.contains(reason), "{said}");
+    }
+    assert!(!place.path("frames").exists());
+}
+
+/// What `lut --space linear` writes is for colours the renderer does not composite; the paper's choice says so itself.
+#[test]
+fn a_table_for_linear_light_is_refused_unless_it_is_the_papers() {
+    let place = Place::with_run();
+    let render = |table: &str| place.run(&["render", "run", "--scene", "scene", "--lut", table, "--out", "frames"]);
+    place.run(&["lut", "--rule", "vertex", "--sample", "centre", "--space", "linear", "--out", "linear.json"]).done();
+    assert!(render("linear.json").refused().contains("linear light"));
+    place.run(&["lut", "--preset", "paper", "--out", "paper.json"]).done();
+    render("paper.json").done();
+}
+
+#[test]
+fn the_study_compares_every_rule() {
+    let place = Place::with_run();
+    let args = ["bench", "termination", "run", "--scene", "scene", "--views", "1", "--repeats", "1", "--out", "study"];
+    let ended = place.run(&args).done();
+    let files = ["delta_e.png", "error_over_time.svg", "left.png", "quality_over_gamma.svg", "termination.csv"];
+    assert_eq!(place.list("study"), [&files[..], &["termination.json"]].concat());
+    let rows: serde_json::Value = serde_json::from_str(&ended.stdout).expect("JSON");
+    let rows = rows.as_array().expect("rows");
+    assert_eq!(rows.len(), 16);
+    assert_eq!(place.read("study/termination.csv").lines().count(), 17);
+    let strict = rows.iter().find(|r| r["rule"] == "strict" && r["gamma"] == 1.0).expect("a row");
+    assert!(strict["delta_e_max"].as_f64().expect("a number") <= 1.05, "{strict}");
+    let refused = place.run(&["bench", "termination", "run", "--scene", "scene", "--repeats", "0"]).refused();
+    assert!(refused.contains("nothing would be measured"));
+    fs::remove_dir_all(place.path("study")).expect("there");
+}

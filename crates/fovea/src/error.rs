@@ -26,6 +26,9 @@ pub enum Error {
         /// The range.
         expected: String,
     },
+    /// A GPU cannot do it.
+    #[error(transparent)]
+    Render(#[from] gazesplat_render::Error),
 }
 
 impl Error {

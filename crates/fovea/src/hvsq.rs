@@ -6,7 +6,11 @@
 //!
 //! Images are `[height, width, 3 or more]`, sRGB-encoded, nominally 0..1, not clamped. Sides that are no multiples of 32
 //! are enlarged to the next one. Colours that are not finite give a value that is not finite.
+//!
+//! A comparison is computed where its reference lives, on the host or on a GPU; what lives elsewhere comes there.
 
+#[cfg(feature = "gpu")]
+pub(crate) mod device;
 pub mod loss;
 pub mod op;
 pub mod plain;
@@ -20,7 +24,8 @@ pub use loss::{HvsqLoss, HvsqMetric, ReferenceCache};
 use crate::error::{Error, Result};
 use crate::hvs::pooling::Pooling;
 use crate::hvs::pyramid::FilterBank;
-use crate::kernels::cpu::hvsq::{Plan, Regions, Statistics, Wanted, enlarged};
+use crate::kernels::cpu::hvsq::{Found, Plan, Regions, Statistics, Wanted, enlarged};
+use burn::tensor::Device;
 use std::sync::Arc;
 
 /// How images are compared.
@@ -41,19 +46,48 @@ pub struct HvsqReference {
 #[derive(Debug)]
 struct Inner {
     hvsq: Hvsq,
-    plan: Plan<f32>,
-    statistics: Statistics<f32>,
+    size: (usize, usize),
+    held: Held,
+}
+
+/// Where a reference lives.
+#[derive(Debug)]
+enum Held {
+    Host {
+        plan: Box<Plan<f32>>,
+        statistics: Statistics<f32>,
+    },
+    #[cfg(feature = "gpu")]
+    Device(Box<device::DeviceReference>),
 }
 
 impl HvsqReference {
     /// Width and height of the images it can be compared with.
     pub fn size(&self) -> (usize, usize) {
-        self.inner.plan.size()
+        self.inner.size
     }
 
     /// Memory it takes, bytes, without the tables that depend on the size alone.
     pub fn num_bytes(&self) -> usize {
-        self.inner.statistics.num_bytes()
+        match &self.inner.held {
+            Held::Host { statistics, .. } => statistics.num_bytes(),
+            #[cfg(feature = "gpu")]
+            Held::Device(reference) => reference.num_bytes(),
+        }
+    }
+
+    /// Whether it lives on a GPU.
+    pub fn is_on_gpu(&self) -> bool {
+        !matches!(self.inner.held, Held::Host { .. })
+    }
+
+    /// What lives on a GPU.
+    #[cfg(feature = "gpu")]
+    pub(crate) fn on_device(&self) -> Option<&device::DeviceReference> {
+        match &self.inner.held {
+            Held::Host { .. } => None,
+            Held::Device(reference) => Some(reference),
+        }
     }
 
     /// How it is compared.
@@ -120,7 +154,28 @@ impl Hvsq {
         self.check_size(size)?;
         let plan = Plan::new(size, &self.bank, &self.pooling, self.distance);
         let statistics = plan.statistics(&image);
-        Ok(HvsqReference { inner: Arc::new(Inner { hvsq: self.clone(), plan, statistics }) })
+        Ok(self.held(size, Held::Host { plan: Box::new(plan), statistics }))
+    }
+
+    /// As [`Hvsq::reference`], living on `device`: on a GPU, where it is one.
+    ///
+    /// # Errors
+    /// As [`Hvsq::reference`]; [`Error::Render`] when a GPU cannot hold it.
+    pub fn reference_on(&self, image: ImageView<'_, f32>, device: &Device) -> Result<HvsqReference> {
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = gazesplat_render::gpu::Gpu::from_device(device) {
+            check_image(&image)?;
+            let size = (image.width, image.height);
+            self.check_size(size)?;
+            return Ok(self.held(size, Held::Device(Box::new(device::DeviceReference::new(&gpu, self, image)?))));
+        }
+        #[cfg(not(feature = "gpu"))]
+        let _ = device;
+        self.reference(image)
+    }
+
+    fn held(&self, size: (usize, usize), held: Held) -> HvsqReference {
+        HvsqReference { inner: Arc::new(Inner { hvsq: self.clone(), size, held }) }
     }
 }
 
@@ -128,7 +183,7 @@ impl HvsqReference {
     /// HVSQ of `image`.
     ///
     /// # Errors
-    /// [`Error::Shape`] when it has another size.
+    /// [`Error::Shape`] when it has another size; of a reference on a GPU, [`Error::Render`] when that does not answer.
     pub fn value(&self, image: ImageView<'_, f32>) -> Result<f64> {
         Ok(self.compare(image, Wanted { gradient: false, map: false, regions: None })?.values[0])
     }
@@ -158,6 +213,13 @@ impl HvsqReference {
             });
         }
         let regions = Regions::new(labels, size, num_regions);
+        #[cfg(feature = "gpu")]
+        if let Some(reference) = self.on_device() {
+            self.check_compared(&image)?;
+            let value = |k| reference.region(image, &regions, k);
+            let some = |k| if regions.is_empty(k) { Ok(None) } else { value(k).map(Some) };
+            return (0..num_regions).map(some).collect();
+        }
         let found = self.compare(image, Wanted { gradient: false, map: false, regions: Some(&regions) })?;
         let some = |(k, value)| (!regions.is_empty(k)).then_some(value);
         Ok(found.values.into_iter().take(num_regions).enumerate().map(some).collect())
@@ -167,7 +229,7 @@ impl HvsqReference {
     /// coarser levels are enlarged bilinearly.
     ///
     /// # Errors
-    /// As [`HvsqReference::value`].
+    /// As [`HvsqReference::value`]; [`Error::Parameter`] of a reference on a GPU: pictures are made on the host.
     pub fn value_and_map(&self, image: ImageView<'_, f32>) -> Result<(f64, Vec<f32>)> {
         let found = self.compare(image, Wanted { gradient: false, map: true, regions: None })?;
         Ok((found.values[0], found.map))
@@ -186,14 +248,25 @@ impl HvsqReference {
         })
     }
 
-    fn compare(
-        &self,
-        image: ImageView<'_, f32>,
-        wanted: Wanted<'_, f32>,
-    ) -> Result<crate::kernels::cpu::hvsq::Found<f32>> {
-        check_image(&image)?;
-        self.check_image_size((image.width, image.height))?;
-        Ok(self.inner.plan.compare(&self.inner.statistics, &image, wanted))
+    fn check_compared(&self, image: &ImageView<'_, f32>) -> Result<()> {
+        check_image(image)?;
+        self.check_image_size((image.width, image.height))
+    }
+
+    fn compare(&self, image: ImageView<'_, f32>, wanted: Wanted<'_, f32>) -> Result<Found<f32>> {
+        self.check_compared(&image)?;
+        match &self.inner.held {
+            Held::Host { plan, statistics } => Ok(plan.compare(statistics, &image, wanted)),
+            #[cfg(feature = "gpu")]
+            Held::Device(_) if wanted.map => {
+                Err(Error::parameter("reference of a per-pixel map", "one on a GPU", "one on the host"))
+            }
+            #[cfg(feature = "gpu")]
+            Held::Device(reference) => {
+                let (value, v_image) = reference.value(image, wanted.gradient)?;
+                Ok(Found { values: vec![value], v_image, map: Vec::new() })
+            }
+        }
     }
 }
 

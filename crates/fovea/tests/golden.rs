@@ -1,14 +1,17 @@
-//! HVSQ in float32 against the golden records, within the tolerances of the specification (hvsq.md §12).
+//! HVSQ in float32 against the golden records, within the tolerances of the specification (hvsq.md §12), on the CPU and on
+//! a GPU.
 
+use burn::tensor::Device;
 use gazesplat_core::{Display, Gaze, Pinhole, PixelGrid};
 use gazesplat_fovea::Hvsq;
 use gazesplat_fovea::hvs::pooling::{GazePooling, Growth, Pooling};
 use gazesplat_fovea::hvs::pyramid::{FilterBank, Taps};
 use gazesplat_fovea::hvsq::plain::PlainPooling;
-use gazesplat_fovea::hvsq::{Distance, ImageView};
+use gazesplat_fovea::hvsq::{Distance, HvsqReference, ImageView};
 use gazesplat_testkit::reference::hvsq::images::{interleaved, pair};
 use gazesplat_testkit::{difference, golden};
 use serde_json::Value;
+use std::cell::RefCell;
 
 /// Relative error of values: what float32 sums of squares of differences keep (§12, tests 3, 4, 7).
 const VALUE: f64 = 1e-5;
@@ -20,6 +23,44 @@ fn gradient_tolerance(distance: Distance) -> f64 {
         Distance::L1 => 2e-2,
     }
 }
+
+thread_local! {
+    /// The device that references live on.
+    static DEVICE: RefCell<Device> = RefCell::new(gazesplat_render::cpu_device());
+}
+
+fn reference_of(hvsq: &Hvsq, image: ImageView<'_, f32>) -> HvsqReference {
+    let device = DEVICE.with_borrow(Device::clone);
+    let reference = hvsq.reference_on(image, &device).expect("valid");
+    assert_eq!(reference.is_on_gpu(), gazesplat_render::is_gpu(&device));
+    reference
+}
+
+/// The bodies of tests once more, with references that live on a GPU.
+macro_rules! on_gpu {
+    ($($body:ident),+ $(,)?) => {
+        mod on_gpu {
+            $(
+                #[test]
+                fn $body() {
+                    let opened = gazesplat_render::device::gpu_device(None);
+                    let Some(gpu) = gazesplat_testkit::devices::required_gpu(opened) else { return };
+                    super::DEVICE.set(gpu);
+                    super::$body();
+                }
+            )+
+        }
+    };
+}
+
+on_gpu!(
+    golden_formula_uniform,
+    golden_formula_gaze,
+    golden_formula_gradients,
+    golden_formula_regions,
+    golden_formula_resized,
+    golden_rtgs_values_and_gradients,
+);
 
 const DISTANCES: [(&str, Distance); 2] = [("MSE", Distance::Mse), ("L1", Distance::L1)];
 
@@ -53,9 +94,15 @@ fn gaze(x: f64, y: f64, grid: PixelGrid) -> Pooling {
 fn of_formula(pooling: Pooling, distance: Distance) -> (f64, Vec<f32>) {
     let [a, b] = pair(96, 160).map(|i| interleaved(&i, 3));
     let hvsq = Hvsq::new(pooling, distance).expect("valid");
-    let reference = hvsq.reference(view(&a, 160, 96, 3)).expect("valid");
+    let reference = reference_of(&hvsq, view(&a, 160, 96, 3));
     let (value, gradient) = reference.value_and_gradient(view(&b, 160, 96, 3)).expect("same size");
-    assert_eq!(reference.value(view(&b, 160, 96, 3)).expect("same size"), value, "the value alone");
+    let alone = reference.value(view(&b, 160, 96, 3)).expect("same size");
+    if reference.is_on_gpu() {
+        // Another kernel, whose products the driver may fuse otherwise.
+        assert!((alone / value - 1.0).abs() < VALUE, "the value alone: {alone:e} {value:e}");
+    } else {
+        assert_eq!(alone, value, "the value alone");
+    }
     (value, gradient)
 }
 
@@ -133,7 +180,7 @@ fn golden_formula_regions() {
     let json = formula();
     let [a, b] = pair(96, 160).map(|i| interleaved(&i, 3));
     let hvsq = Hvsq::new(uniform(3.0), Distance::Mse).expect("valid");
-    let reference = hvsq.reference(view(&a, 160, 96, 3)).expect("valid");
+    let reference = reference_of(&hvsq, view(&a, 160, 96, 3));
     let labels: Vec<u8> = (0..96 * 160).map(|i| u8::from(i % 160 >= 56)).collect();
     let found = reference.by_region(view(&b, 160, 96, 3), &labels, 3).expect("same size");
     let [Some(inside), Some(outside), None] = found[..] else { panic!("{found:?}") };
@@ -151,7 +198,7 @@ fn golden_formula_resized() {
         for (name, distance) in DISTANCES {
             let [a, b] = pair(90, 150).map(|i| interleaved(&i, 5));
             let hvsq = Hvsq::new(uniform(f64::from(p)), distance).expect("valid");
-            let reference = hvsq.reference(view(&a, 150, 90, 5)).expect("valid");
+            let reference = reference_of(&hvsq, view(&a, 150, 90, 5));
             let value = reference.value(view(&b, 150, 90, 5)).expect("same size");
             let key = format!("ps{p}_{name}");
             assert_relative(value, &json["resize"][&key], VALUE, &format!("resize {key}"));
@@ -220,7 +267,7 @@ fn golden_rtgs_values_and_gradients() {
         let distance = if config["loss_type"] == "L1" { Distance::L1 } else { Distance::Mse };
         let bank = if number(&config["n_orientations"]) == 2.0 { two.clone() } else { FilterBank::sp5() };
         let hvsq = Hvsq::with_bank(pooling, distance, bank).expect("valid");
-        let reference = hvsq.reference(view(&reference, 96, 64, 3)).expect("valid");
+        let reference = reference_of(&hvsq, view(&reference, 96, 64, 3));
         let (value, gradient) = reference.value_and_gradient(view(&altered, 96, 64, 3)).expect("same size");
         assert_relative(value, &config["loss"], VALUE, name);
         let d = difference(&gradient, &record.f64(&format!("{name}.grad_alt")));

@@ -3,10 +3,11 @@
 use super::op::{HvsqTarget, hvsq};
 use super::{Hvsq, HvsqReference, ImageView};
 use crate::hvs::pooling::Pooling;
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
 use gazesplat_core::color::from_u8;
 use gazesplat_core::image::ImageF32;
 use gazesplat_core::io::images::TrainingImage;
+use gazesplat_render::is_gpu;
 use gazesplat_train::losses::{ImageLoss, ImageLossValue, LossTarget};
 use gazesplat_train::metrics::ImageMetric;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -17,6 +18,7 @@ pub const DEFAULT_CACHE_BYTES: usize = 512 << 20;
 /// Statistics of photographs, the ones used least recently dropped first when they take too much memory.
 ///
 /// Uniform pools above one pixel only: other comparisons keep nothing but the colours, which are as quickly made again.
+/// Statistics on the host and on a GPU are kept apart; a cache is for one GPU.
 #[derive(Debug)]
 pub struct ReferenceCache {
     hvsq: Hvsq,
@@ -60,9 +62,29 @@ impl ReferenceCache {
     /// # Errors
     /// As [`Hvsq::reference`].
     pub fn get(&self, target: &LossTarget) -> crate::Result<HvsqReference> {
+        self.get_with(target, false, |image| self.hvsq.reference(image))
+    }
+
+    /// As [`ReferenceCache::get`], living on `device`.
+    ///
+    /// # Errors
+    /// As [`Hvsq::reference_on`].
+    pub fn get_on(&self, target: &LossTarget, device: &Device) -> crate::Result<HvsqReference> {
+        self.get_with(target, is_gpu(device), |image| self.hvsq.reference_on(image, device))
+    }
+
+    fn get_with(
+        &self,
+        target: &LossTarget,
+        on_gpu: bool,
+        reference: impl FnOnce(ImageView<'_, f32>) -> crate::Result<HvsqReference>,
+    ) -> crate::Result<HvsqReference> {
         let background = target.background().map(|b| b.map(f32::to_bits));
-        let is_same =
-            |e: &Entry| std::ptr::eq(e.photo.as_ptr(), Arc::as_ptr(target.photo())) && e.background == background;
+        let is_same = |e: &Entry| {
+            std::ptr::eq(e.photo.as_ptr(), Arc::as_ptr(target.photo()))
+                && e.background == background
+                && e.reference.is_on_gpu() == on_gpu
+        };
         let mut entries = self.lock();
         if let Some(i) = entries.kept.iter().position(is_same) {
             let entry = entries.kept.remove(i);
@@ -74,7 +96,7 @@ impl ReferenceCache {
         drop(entries);
         let (width, height) = target.size();
         let data: Vec<f32> = target.rgb().iter().map(|v| from_u8(*v)).collect();
-        let reference = self.hvsq.reference(ImageView { width, height, channels: 3, data: &data })?;
+        let reference = reference(ImageView { width, height, channels: 3, data: &data })?;
         if matches!(self.hvsq.pooling(), Pooling::Uniform { size_px } if *size_px > 1.0) {
             let mut entries = self.lock();
             let photo = Arc::downgrade(target.photo());
@@ -107,11 +129,14 @@ impl HvsqLoss {
     }
 }
 
+/// Why statistics can be computed in a training.
+const CHECKED: &str = "the size of every photograph was checked, and the adapter took a model that is larger";
+
 impl ImageLoss for HvsqLoss {
     /// # Panics
     /// If the pools are larger than the photograph: [`Hvsq::check_size`] tells before a training begins.
     fn evaluate(&self, image: Tensor<3>, target: &LossTarget) -> ImageLossValue {
-        let reference = self.cache.get(target).expect("the size of every photograph was checked");
+        let reference = self.cache.get_on(target, &image.device()).expect(CHECKED);
         let loss = hvsq(image, HvsqTarget { reference, photo: Some(target.clone()) });
         ImageLossValue { terms: loss.clone().inner(), loss, names: &["hvsq"] }
     }

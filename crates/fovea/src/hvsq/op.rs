@@ -1,7 +1,8 @@
 //! HVSQ as one differentiable operation, with its gradient written by hand.
 //!
-//! The result is a scalar, so its gradient is computed together with it; the backward pass only scales it. The kernels are
-//! those of the CPU on every backend: from a GPU the image comes to the host, and the gradient goes back.
+//! The result is a scalar, so its gradient is computed together with it; the backward pass only scales it. It is computed
+//! where the reference lives: of an image and a reference on the same GPU nothing comes to the host; otherwise the image
+//! goes to the reference, and the gradient comes back.
 
 #![expect(deprecated, reason = "burn-ndarray is this project's default CPU backend until its successor replaces it")]
 
@@ -122,20 +123,19 @@ mod flex {
     }
 }
 
-/// The image comes to the host and the gradient goes back. A device that stopped gives a value that is not a number;
-/// reading anything else from it is an error.
+/// Of a reference on the same adapter everything stays there. Of one on the host the image comes to it and the gradient goes
+/// back; a device that stopped then gives a value that is not a number, and reading anything else from it is an error.
 #[cfg(feature = "gpu")]
 mod cube {
-    use super::{FloatTensor, HvsqGradientOps, HvsqOps, HvsqTarget, value_and_gradient_of, value_of};
-    use burn::backend::ops::FloatTensorOps;
-    use burn::tensor::DType;
+    use super::{FloatTensor, HvsqGradientOps, HvsqOps, HvsqTarget, SAME_SIZE, value_and_gradient_of, value_of};
+    use crate::hvsq::device::DeviceReference;
+    use crate::kernels::gpu::hvsq::{Found, scaled, unmasked, unmasked_bwd};
     use burn_cubecl::{CubeBackend, tensor::CubeTensor};
     use gazesplat_render::gpu::{Gpu, contiguous};
+    use gazesplat_train::losses::LossTarget;
 
-    fn upload(gpu: &Gpu, values: &[f32], shape: &[usize]) -> CubeTensor {
-        let words: Vec<u32> = values.iter().map(|v| v.to_bits()).collect();
-        CubeTensor { dtype: DType::F32, ..gpu.upload_u32(&words, shape) }
-    }
+    /// The buffers of a comparison are at most a few times as large as the image.
+    const FITS: &str = "the adapter holds the statistics of an image of that size";
 
     /// The adapter, shape and values of an image.
     fn download(image: FloatTensor<CubeBackend>) -> (Gpu, Vec<usize>, Vec<f32>) {
@@ -146,23 +146,60 @@ mod cube {
         (gpu, shape, values)
     }
 
+    /// The photograph where a mask leaves out pixels, as kernels take it: a word per pixel, red in the lowest byte, the
+    /// highest 0 at masked pixels.
+    fn mask(gpu: &Gpu, target: &HvsqTarget) -> Option<CubeTensor> {
+        let photo: &LossTarget = target.photo.as_ref()?;
+        let words: Vec<u32> = photo
+            .rgb()
+            .chunks_exact(3)
+            .zip(photo.mask()?)
+            .map(|(color, mask)| u32::from_le_bytes([color[0], color[1], color[2], if *mask == 0 { 0 } else { 255 }]))
+            .collect();
+        Some(gpu.upload_u32(&words, &[words.len()]))
+    }
+
+    fn compare(
+        image: FloatTensor<CubeBackend>,
+        reference: &DeviceReference,
+        target: &HvsqTarget,
+        gradient: bool,
+    ) -> Found {
+        let image = contiguous(image);
+        let (width, height) = target.reference.size();
+        assert_eq!(image.meta.shape()[..2], [height, width], "{SAME_SIZE}");
+        let gpu = reference.gpu();
+        let Some(mask) = mask(gpu, target) else { return reference.compare(&image, gradient).expect(FITS) };
+        let found = reference.compare(&unmasked(gpu, &image, &mask).expect(FITS), gradient).expect(FITS);
+        if let Some(v_image) = &found.v_image {
+            unmasked_bwd(gpu, v_image, &mask);
+        }
+        found
+    }
+
     impl HvsqOps for CubeBackend {
         fn hvsq(image: FloatTensor<Self>, target: HvsqTarget) -> FloatTensor<Self> {
+            if let Some(reference) = target.reference.on_device() {
+                return compare(image, reference, &target, false).value;
+            }
             let (gpu, shape, values) = download(image);
-            upload(&gpu, &[value_of(&values, &shape, &target)], &[1])
+            gpu.upload_f32(&[value_of(&values, &shape, &target)], &[1])
         }
     }
 
     impl HvsqGradientOps for CubeBackend {
         fn hvsq_with_gradient(image: FloatTensor<Self>, target: HvsqTarget) -> (FloatTensor<Self>, FloatTensor<Self>) {
+            if let Some(reference) = target.reference.on_device() {
+                let found = compare(image, reference, &target, true);
+                return (found.value, found.v_image.expect("a gradient was asked for"));
+            }
             let (gpu, shape, values) = download(image);
             let (value, gradient) = value_and_gradient_of(&values, &shape, &target);
-            (upload(&gpu, &[value], &[1]), upload(&gpu, &gradient, &shape))
+            (gpu.upload_f32(&[value], &[1]), gpu.upload_f32(&gradient, &shape))
         }
 
         fn scaled_by_value(gradient: FloatTensor<Self>, v_value: FloatTensor<Self>) -> FloatTensor<Self> {
-            let v_value = Self::float_reshape(v_value, [1, 1, 1].into());
-            Self::float_mul(gradient, v_value)
+            scaled(&Gpu::of(&gradient), gradient, contiguous(v_value))
         }
     }
 }

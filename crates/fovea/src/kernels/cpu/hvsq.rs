@@ -18,7 +18,7 @@
 //! 4 × 4 (2 × 2 the residual). NaN anywhere in the colours gives a value that is not finite.
 
 mod compare;
-mod gaze;
+pub(crate) mod gaze;
 mod gradient;
 mod regions;
 mod statistics;
@@ -245,6 +245,7 @@ impl<T: Real> Plan<T> {
     }
 
     /// Size of the images: width, height.
+    #[cfg(test)]
     pub fn size(&self) -> (usize, usize) {
         self.resize.from
     }

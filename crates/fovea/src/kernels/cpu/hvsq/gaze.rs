@@ -34,7 +34,7 @@ struct Mip<T> {
 
 /// Pooling of one level.
 #[derive(Debug, Clone)]
-pub(super) struct GazeLevel<T> {
+pub(crate) struct GazeLevel<T> {
     width: usize,
     height: usize,
     mips: Vec<Mip<T>>,
@@ -81,9 +81,21 @@ impl<T: Real> GazeLevel<T> {
         Self { width, height, mips, first, weight, used }
     }
 
+    /// Sizes of the mips, finest first.
+    #[cfg(feature = "gpu")]
+    pub fn mip_sizes(&self) -> impl Iterator<Item = (usize, usize)> {
+        self.mips.iter().map(|mip| (mip.width, mip.height))
+    }
+
+    /// First of the two mips of every pixel, and the weight of the second.
+    #[cfg(feature = "gpu")]
+    pub fn lods(&self) -> impl Iterator<Item = (u8, T)> {
+        self.first.iter().copied().zip(self.weight.iter().copied())
+    }
+
     /// Compares the responses of two planes to one filter: tallies of bands of rows, and the gradient by the responses of
     /// the first, `[height, width]`, empty when not wanted.
-    pub fn compare(
+    pub(super) fn compare(
         &self,
         planes: [&Plane<T>; 2],
         kernel: &Kernel<T>,

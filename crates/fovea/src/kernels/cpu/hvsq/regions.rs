@@ -47,6 +47,12 @@ impl<T: Real> Regions<T> {
         Self { weights, totals }
     }
 
+    /// Weights and their sum of region `k`, level by level.
+    #[cfg(feature = "gpu")]
+    pub fn levels(&self, k: usize) -> impl Iterator<Item = (&[T], f64)> {
+        self.weights.iter().zip(&self.totals).map(move |(weights, totals)| (&weights[k][..], totals[k]))
+    }
+
     /// How many there are.
     pub fn num_regions(&self) -> usize {
         self.totals[0].len()

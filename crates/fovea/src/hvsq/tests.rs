@@ -4,6 +4,7 @@ use super::op::{HvsqTarget, hvsq};
 use super::*;
 use crate::hvs::pooling::GazePooling;
 use burn::tensor::{Device, Tensor, TensorData};
+use gazesplat_core::Gaze;
 use gazesplat_core::color::from_u8;
 use gazesplat_core::image::{ImageF32, RgbImage8};
 use gazesplat_core::io::images::TrainingImage;
@@ -42,13 +43,16 @@ fn view(data: &[f32]) -> ImageView<'_, f32> {
     ImageView { width: SIZE.0, height: SIZE.1, channels: data.len() / (SIZE.0 * SIZE.1), data }
 }
 
+fn gpu() -> Option<Device> {
+    required_gpu(gazesplat_render::device::gpu_device(None))
+}
+
 fn devices() -> Vec<Device> {
     #[cfg(feature = "flex")]
     let flex = Some(gazesplat_render::flex_device());
     #[cfg(not(feature = "flex"))]
     let flex = None;
-    let gpu = required_gpu(gazesplat_render::device::gpu_device(None));
-    [Some(gazesplat_render::cpu_device()), flex, gpu].into_iter().flatten().collect()
+    [Some(gazesplat_render::cpu_device()), flex, gpu()].into_iter().flatten().collect()
 }
 
 fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
@@ -79,6 +83,150 @@ fn every_backend_has_the_value_and_gradient_of_the_kernel() {
             assert_eq!(differentiated(&device, &image, of.clone(), 3.0).1, tripled, "{pooling:?}");
             let plain = Tensor::from_data(TensorData::new(image.clone(), [SIZE.1, SIZE.0, 4]), &device);
             assert_eq!(values(hvsq(plain, of)), [value as f32]);
+        }
+    }
+}
+
+/// Relative error of a value of the GPU against one of the CPU (hvsq.md §12, test 14).
+const GPU_VALUE: f64 = 1e-5;
+/// Relative L2 error of gradients in f32 (hvsq.md §12, test 6): signs of tiny differences flip where distances are L1.
+fn gpu_gradient(distance: Distance) -> f64 {
+    if distance == Distance::L1 { 2e-2 } else { 1e-4 }
+}
+
+/// Looked at: the centre, a corner, far outside, a pixel centre.
+fn gazes() -> impl Iterator<Item = Pooling> {
+    [(0.5, 0.5), (0.0, 1.0), (3.0, -2.0), (20.5 / 70.0, 12.5 / 45.0)].into_iter().map(|(x, y)| {
+        let gaze = Gaze::new(x, y).unwrap();
+        Pooling::Gaze(GazePooling { gaze, alpha: 0.4, ..GazePooling::default() })
+    })
+}
+
+fn noise_of(seed: u64, (width, height): (usize, usize), channels: usize) -> Vec<f32> {
+    let mut rng = Rng::new(seed);
+    (0..width * height * channels).map(|_| rng.unit() as f32).collect()
+}
+
+fn view_of(data: &[f32], (width, height): (usize, usize)) -> ImageView<'_, f32> {
+    ImageView { width, height, channels: data.len() / (width * height), data }
+}
+
+/// Value and gradient in all forms, of sizes that no tile or workgroup divides, a single pixel among them.
+#[test]
+fn gpu_equals_cpu_in_value_and_gradient() {
+    let Some(gpu) = gpu() else { return };
+    let sizes = [((1, 1), 3), ((5, 70), 4), ((33, 47), 3), ((64, 32), 3), ((150, 90), 5)];
+    let poolings = [1.0, 1.5, 2.0, 2.5, 3.0, 7.0, 12.0, 29.7, 32.0].map(uniform).into_iter().chain(gazes());
+    for pooling in poolings {
+        for distance in [Distance::Mse, Distance::L1] {
+            for (size, channels) in sizes {
+                let what = format!("{pooling:?} {distance:?} {size:?}");
+                let (a, b) = (noise_of(1, size, 3), noise_of(2, size, channels));
+                let (a, b) = (view_of(&a, size), view_of(&b, size));
+                let hvsq = Hvsq::new(pooling, distance).unwrap();
+                let (value, gradient) = hvsq.reference(a).unwrap().value_and_gradient(b).unwrap();
+                let on_gpu = hvsq.reference_on(a, &gpu).unwrap();
+                assert!(on_gpu.is_on_gpu() && on_gpu.size() == size);
+                let (found, v_image) = on_gpu.value_and_gradient(b).unwrap();
+                let alone = on_gpu.value(b).unwrap();
+                for found in [found, alone] {
+                    assert!((found / value - 1.0).abs() < GPU_VALUE, "{what}: {found:e} instead of {value:e}");
+                }
+                let d = gazesplat_testkit::difference(
+                    &v_image,
+                    &gradient.iter().map(|v| f64::from(*v)).collect::<Vec<_>>(),
+                );
+                assert!(d.relative_l2 < gpu_gradient(distance), "{what}: {d:?}");
+                assert!(v_image.chunks_exact(channels).all(|pixel| pixel[3..].iter().all(|v| *v == 0.0)), "{what}");
+            }
+        }
+    }
+}
+
+#[test]
+fn gpu_equals_cpu_by_region() {
+    let Some(gpu) = gpu() else { return };
+    let size = (45, 70);
+    let (a, b) = (noise_of(3, size, 3), noise_of(4, size, 3));
+    let (a, b) = (view_of(&a, size), view_of(&b, size));
+    let labels: Vec<u8> = (0..45 * 70).map(|i| ((i % 45) / 12 + (i / 45) / 30) as u8 % 3).collect();
+    for pooling in [1.0, 2.0, 3.0, 7.5].map(uniform).into_iter().chain(gazes()) {
+        for distance in [Distance::Mse, Distance::L1] {
+            let hvsq = Hvsq::new(pooling, distance).unwrap();
+            let expected = hvsq.reference(a).unwrap().by_region(b, &labels, 4).unwrap();
+            let found = hvsq.reference_on(a, &gpu).unwrap().by_region(b, &labels, 4).unwrap();
+            assert_eq!(found[3], None);
+            for (found, expected) in found[..3].iter().zip(&expected) {
+                let (found, expected) = (found.unwrap(), expected.unwrap());
+                assert!((found / expected - 1.0).abs() < GPU_VALUE, "{pooling:?}: {found:e} {expected:e}");
+            }
+        }
+    }
+}
+
+/// Equal images; two runs; NaN in either image.
+#[test]
+fn gpu_gives_zero_the_same_bits_and_nan() {
+    let Some(gpu) = gpu() else { return };
+    let size = (70, 45);
+    let (a, b) = (noise_of(5, size, 3), noise_of(6, size, 3));
+    let mut spoilt = a.clone();
+    spoilt[3 * (17 * 70 + 5) + 2] = f32::NAN;
+    let flat = vec![0.25f32; a.len()];
+    let [a, b, spoilt, flat] = [&a, &b, &spoilt, &flat].map(|data| view_of(data, size));
+    for pooling in [1.0, 2.0, 3.0, 7.5].map(uniform).into_iter().chain(gazes()) {
+        for distance in [Distance::Mse, Distance::L1] {
+            let hvsq = Hvsq::new(pooling, distance).unwrap();
+            let reference = |image| hvsq.reference_on(image, &gpu).unwrap();
+            for image in [a, flat] {
+                let (value, v_image) = reference(image).value_and_gradient(image).unwrap();
+                assert!(value == 0.0 && v_image.iter().all(|v| *v == 0.0), "{pooling:?} {distance:?}: {value:e}");
+            }
+            let run = || {
+                let (value, v_image) = reference(a).value_and_gradient(b).unwrap();
+                (value.to_bits(), v_image.iter().map(|v| v.to_bits()).collect::<Vec<_>>())
+            };
+            assert!(run() == run(), "{pooling:?} {distance:?}");
+            assert!(reference(a).value(spoilt).unwrap().is_nan(), "{pooling:?} {distance:?}");
+            assert!(reference(spoilt).value(a).unwrap().is_nan(), "{pooling:?} {distance:?}");
+        }
+    }
+}
+
+/// The operation with the reference on the adapter: as the kernels on the host, with a mask and without, and through the
+/// loss, whose statistics live where the image does.
+#[test]
+fn operation_stays_on_the_gpu() {
+    let Some(gpu) = gpu() else { return };
+    let mut rng = Rng::new(20);
+    let mask: Vec<u8> = (0..SIZE.0 * SIZE.1).map(|_| u8::from(rng.unit() > 0.3)).collect();
+    let image = noise(21, 4);
+    for (target, is_masked) in [(photo(22, None), false), (photo(22, Some(mask.clone())), true)] {
+        for (p, distance) in [(1.0, Distance::Mse), (3.0, Distance::Mse), (3.0, Distance::L1)] {
+            let cache = Arc::new(ReferenceCache::new(Hvsq::new(uniform(p), distance).unwrap(), 1 << 30));
+            let of = |reference| HvsqTarget { reference, photo: Some(target.clone()) };
+            let on_gpu = of(cache.get_on(&target, &gpu).unwrap());
+            assert!(on_gpu.reference.is_on_gpu());
+            let cpu = gazesplat_render::cpu_device();
+            let (value, gradient) = differentiated(&cpu, &image, of(cache.get(&target).unwrap()), 3.0);
+            let gradient: Vec<f64> = gradient.iter().map(|v| f64::from(*v)).collect();
+            // An image on the host comes to the reference, too.
+            for device in [&gpu, &cpu] {
+                let (found, v_image) = differentiated(device, &image, on_gpu.clone(), 3.0);
+                assert!(f64::from(found / value - 1.0).abs() < GPU_VALUE, "p {p}: {found:e} instead of {value:e}");
+                let d = gazesplat_testkit::difference(&v_image, &gradient);
+                assert!(d.relative_l2 < gpu_gradient(distance), "p {p}: {d:?}");
+                for (v, m) in v_image.chunks_exact(4).zip(&mask).filter(|_| is_masked) {
+                    assert_eq!(*m == 0, v.iter().all(|v| *v == 0.0));
+                }
+            }
+            let losses = WeightedLosses::default().with(0.5, Box::new(HvsqLoss::new(Arc::clone(&cache))));
+            let num_misses = cache.num_misses();
+            let tensor = Tensor::from_data(TensorData::new(image.clone(), [SIZE.1, SIZE.0, 4]), &gpu);
+            let report = losses.evaluate(tensor, &target).unwrap().read().unwrap();
+            assert!(f64::from(report.get("hvsq").unwrap() * 3.0 / value - 1.0).abs() < GPU_VALUE, "{report:?}");
+            let expected = if p == 1.0 { num_misses + 1 } else { num_misses };
+            assert_eq!(cache.num_misses(), expected, "statistics on the GPU are kept like those on the host");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The command line: what is accepted, explained, and which command it becomes. Nothing is opened here.
 
-use crate::commands::{bench, demo, eval, info, lut, render, synth, train};
+use crate::commands::{bench, demo, eval, hvsq, info, lut, render, synth, train};
 use crate::console::Console;
 use crate::diagnostics::Result;
 use crate::settings;
@@ -59,6 +59,8 @@ pub enum Command {
     Train(train::TrainArgs),
     /// Measure a model against the photographs of a scene: PSNR and SSIM
     Eval(eval::EvalArgs),
+    /// Measure how different two pictures look in the corner of the eye
+    Hvsq(hvsq::HvsqCommandArgs),
     /// Draw a model from the cameras of a scene or along a camera path
     Render(render::RenderArgs),
     /// Write a procedural scene: photographs, cameras and sparse points
@@ -93,6 +95,7 @@ pub fn run() -> Result<()> {
     match cli.command {
         Command::Train(args) => train::command(&args, &console),
         Command::Eval(args) => eval::command(&args, &console),
+        Command::Hvsq(args) => hvsq::command(&args, &console),
         Command::Render(args) => render::command(&args, &console),
         Command::Synth(args) => synth::command(&args, &console),
         Command::Demo(args) => demo::command(&args, &console),

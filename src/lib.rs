@@ -13,6 +13,7 @@ pub mod progress;
 pub mod report;
 pub mod run_dir;
 pub mod settings;
+pub mod terms;
 pub mod y4m;
 
 pub use console::Console;

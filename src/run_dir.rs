@@ -10,9 +10,7 @@
 //! | `unfinished.ply` | only of a training that failed, or is under way on a GPU: its last good model |
 
 use crate::diagnostics::{Failure, Result};
-use crate::settings;
 use gazesplat_core::GaussianCloud;
-use gazesplat_train::Config;
 use serde::Serialize;
 use std::fs;
 use std::io::{BufWriter, Write};
@@ -119,17 +117,17 @@ impl RunDir {
         files.into_iter().chain([self.settings_path()]).try_for_each(|file| remove(&file))
     }
 
-    /// Writes `settings.toml`: the resolved settings under lines that say where they come from, and on which device the
+    /// Writes `settings.toml`: the resolved settings as TOML under lines that say where they come from, and on which device the
     /// run computes, which is no setting: it is of the machine.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn write_settings(&self, config: &Config, scene: &Path, device: &str) -> Result<()> {
+    pub fn write_settings(&self, settings: &str, scene: &Path, device: &str) -> Result<()> {
         let text = format!(
             "# Resolved settings of a run of gazesplat {} on `{}`.\n# Computed on: {device}.\n\n{}",
             env!("CARGO_PKG_VERSION"),
             scene.display(),
-            settings::to_toml(config)
+            settings
         );
         write_text(&self.settings_path(), &text)
     }

@@ -1,14 +1,15 @@
 //! Settings in layers: defaults, a preset or TOML file, then `--set key=value`, the later one winning.
 //!
 //! A key that does not exist is refused with the nearest one that does, a value of the wrong type with what was
-//! expected; for files the place is shown. The tree of known keys is the serialised default [`Config`], so nothing here
-//! names a key and nothing can fall behind.
+//! expected; for files the place is shown. The tree of known keys is the serialised default [`Config`], with the terms that
+//! only this program knows ([`TermSection`]) grown into it, so nothing here names a key and nothing can fall behind.
 
 mod keys;
 
 pub use keys::describe_keys;
 
 use crate::diagnostics::{Failure, Result};
+use crate::terms::TermSection;
 use gazesplat_train::Config;
 use keys::{Problem, check_table, find, known_keys, unknown_key};
 use serde_json::Value as Json;
@@ -17,9 +18,10 @@ use toml::Table;
 use toml::de::DeTable;
 
 /// Presets that come with the program, by name: each holds only what differs from the defaults.
-pub const PRESETS: [(&str, &str); 2] = [
+pub const PRESETS: [(&str, &str); 3] = [
     ("quick", include_str!("../configs/train/quick.toml")),
     ("quality", include_str!("../configs/train/quality.toml")),
+    ("finetune", include_str!("../configs/train/finetune.toml")),
 ];
 
 /// The values given so far, without the defaults.
@@ -71,8 +73,13 @@ impl Settings {
         let document = DeTable::parse(text).map_err(|e| at(Problem::from_toml(&e)))?;
         check_table(document.get_ref(), &known_keys(), "").map_err(&at)?;
         // A second reading by the types themselves: names of variants, ranges of integers.
-        toml::from_str::<Config>(text).map_err(|e| at(Problem::from_toml(&e).of_value("", &Json::Null)))?;
         let layer: Table = toml::from_str(text).map_err(|e| at(Problem::from_toml(&e)))?;
+        if split(layer.clone()).1.is_empty() {
+            // By the text, so that the place of what is wrong can be shown.
+            toml::from_str::<Config>(text).map_err(|e| at(Problem::from_toml(&e).of_value("", &Json::Null)))?;
+        } else {
+            read(layer.clone()).map_err(|e| at(Problem::from_toml(&e).of_value("", &Json::Null)))?;
+        }
         merge(&mut self.table, layer);
         Ok(self)
     }
@@ -114,7 +121,7 @@ impl Settings {
         let document = DeTable::parse(&text).map_err(|e| Problem::from_toml(&e))?;
         check_table(document.get_ref(), keys, "")?;
         let layer: Table = toml::from_str(&text).map_err(|e| Problem::from_toml(&e))?;
-        layer.clone().try_into::<Config>().map_err(|e| Problem::from_toml(&e).of_value(key, keys))?;
+        read(layer.clone()).map_err(|e| Problem::from_toml(&e).of_value(key, keys))?;
         let mut next = self.clone();
         merge(&mut next.table, layer);
         Ok(next)
@@ -133,16 +140,54 @@ impl Settings {
     /// # Errors
     /// When the values contradict each other or are out of their range.
     pub fn resolve(&self) -> Result<Config> {
-        let config: Config =
-            self.table.clone().try_into().map_err(|e: toml::de::Error| Failure::new(e.message().to_owned()))?;
+        let (config, _) = read(self.table.clone()).map_err(|e| Failure::new(e.message().to_owned()))?;
         config.validate()?;
         Ok(config)
     }
+
+    /// The defaults of the terms that this program adds, with the given values over them.
+    ///
+    /// # Errors
+    /// When a value is out of its range.
+    pub fn resolve_terms(&self) -> Result<TermSection> {
+        let (_, terms) = read(self.table.clone()).map_err(|e| Failure::new(e.message().to_owned()))?;
+        terms.loss.hvsq.validate()?;
+        Ok(terms)
+    }
+}
+
+/// What of a table belongs to crate `train`, and what to the terms of this program: the tables that [`TermSection`] has in
+/// the sections of [`Config`].
+fn split(mut table: Table) -> (Table, Table) {
+    let known = Table::try_from(TermSection::default()).expect("settings are plain tables of numbers and text");
+    let mut terms = Table::new();
+    for (section, known) in &known {
+        let (Some(toml::Value::Table(found)), toml::Value::Table(known)) = (table.get_mut(section), known) else {
+            continue;
+        };
+        let own: Table = known.keys().filter_map(|key| found.remove_entry(key)).collect();
+        if !own.is_empty() {
+            terms.insert(section.clone(), own.into());
+        }
+    }
+    (table, terms)
+}
+
+/// Both parts of a table by their types.
+fn read(table: Table) -> std::result::Result<(Config, TermSection), toml::de::Error> {
+    let (config, terms) = split(table);
+    Ok((config.try_into()?, terms.try_into()?))
 }
 
 /// The resolved settings as TOML, every key present that has a value.
 pub fn to_toml(config: &Config) -> String {
     toml::to_string_pretty(config).expect("settings are plain tables of numbers and text")
+}
+
+/// The resolved settings of a run with its terms as TOML.
+pub fn run_to_toml(config: &Config, terms: &TermSection) -> String {
+    let terms = toml::to_string_pretty(terms).expect("settings are plain tables of numbers and text");
+    format!("{}\n{terms}", to_toml(config))
 }
 
 fn merge(base: &mut Table, layer: Table) {
@@ -226,6 +271,29 @@ mod tests {
             let config = Settings::new().with_text(Path::new(name), text).and_then(|s| s.resolve()).expect(name);
             assert_ne!(to_toml(&config), defaults, "{name} changes nothing");
         }
+    }
+
+    #[test]
+    fn terms_of_the_program_are_settings_like_any_other() {
+        let settings = Settings::new()
+            .with_text(Path::new("a.toml"), "[loss]\nssim_weight = 0.1\n[loss.hvsq]\nweight = 50\n")
+            .and_then(|s| s.with_override("loss.hvsq.pooling_px=7"))
+            .and_then(|s| s.with_override("loss.hvsq.distance=mse"))
+            .expect("valid");
+        let (config, terms) = (settings.resolve().expect("valid"), settings.resolve_terms().expect("valid"));
+        assert_eq!(config.loss.ssim_weight, 0.1);
+        assert_eq!((terms.loss.hvsq.weight, terms.loss.hvsq.pooling_px), (50.0, 7.0));
+        let text = run_to_toml(&config, &terms);
+        let again = Settings::new().with_text(Path::new("s.toml"), &text).expect("reads back");
+        assert_eq!(run_to_toml(&again.resolve().expect("valid"), &again.resolve_terms().expect("valid")), text);
+
+        assert!(set_refused("loss.hvsq.wieght=3").contains("did you mean `loss.hvsq.weight`?"));
+        assert!(set_refused("loss.hvsq.distance=l3").contains("`loss.hvsq.distance`"));
+        assert!(set_refused("loss.hvsq=3").contains("name one of its keys"));
+        assert!(refused("[loss.hvsq]\npooling_px = true\n").contains("my.toml:2:14"));
+        assert!(refused("[loss.hvsq]\ndistance = \"l3\"\n").contains("l3"));
+        let settings = Settings::new().with_override("loss.hvsq.pooling_px=0.5").expect("a number");
+        assert!(settings.resolve_terms().is_err());
     }
 
     #[test]

@@ -23,8 +23,10 @@ fn run(scene: &Path, out: &Path, overrides: &[&str]) -> Trained {
 /// Trains on `scene` into `out` with settings `overrides`.
 fn run_on(device: &ComputeDevice, scene: &Path, out: &Path, overrides: &[&str]) -> Trained {
     let overrides: Vec<String> = overrides.iter().map(|&o| o.to_owned()).collect();
-    let config = Settings::new().with_overrides(&overrides).and_then(|s| s.resolve()).expect("valid settings");
-    let job = TrainJob { scene, config, out: Some(out), overwrite: false, device };
+    let settings = Settings::new().with_overrides(&overrides).expect("valid settings");
+    let config = settings.resolve().expect("valid settings");
+    let terms = settings.resolve_terms().expect("valid settings");
+    let job = TrainJob { scene, config, terms, init: None, out: Some(out), overwrite: false, device };
     train(&job, &AtomicBool::new(false), &Console::quiet()).expect("training works")
 }
 

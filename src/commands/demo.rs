@@ -12,6 +12,7 @@ use crate::progress;
 use crate::report::{html, pictures};
 use crate::run_dir::cannot_write;
 use crate::settings::Settings;
+use crate::terms::TermSection;
 use clap::Args;
 use gazesplat_core::RgbImage8;
 use gazesplat_core::camera::path::CameraPath;
@@ -81,7 +82,8 @@ fn demo(args: &DemoArgs, device: &ComputeDevice, console: &Console) -> Result<()
         .with_override(&format!("train.steps={}", size.num_steps))?
         .with_override(&format!("densify.cap={}", size.cap))?
         .resolve()?;
-    let job = TrainJob { scene: &scene, config, out: Some(&args.out), overwrite, device };
+    let (terms, out) = (TermSection::default(), Some(args.out.as_path()));
+    let job = TrainJob { scene: &scene, config, terms, init: None, out, overwrite, device };
     let mut trained = train(&job, stop, console)?;
 
     console.note("3/3  an orbit through the model");

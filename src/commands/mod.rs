@@ -4,6 +4,8 @@ pub mod bench;
 pub mod demo;
 pub mod device;
 pub mod eval;
+pub mod hvsq;
+pub mod hvsq_args;
 pub mod info;
 pub mod lut;
 pub mod render;
@@ -133,6 +135,24 @@ impl Model {
         Ok(Self { cloud, path: file, run })
     }
 
+    /// Reads a model as [`Model::load`] does, to go on training it.
+    ///
+    /// # Errors
+    /// As [`Model::load`]; when there is no Gaussian to train.
+    pub fn load_to_train(path: &Path, console: &Console) -> Result<Self> {
+        let model = Self::load(path, console)?;
+        model.check_not_empty("trained")?;
+        Ok(model)
+    }
+
+    fn check_not_empty(&self, what_for: &str) -> Result<()> {
+        if !self.cloud.is_empty() {
+            return Ok(());
+        }
+        Err(Failure::new(format!("`{}` holds no Gaussian that can be {what_for}", self.path.display()))
+            .hint("the model is empty or all its values are broken: export or train it again"))
+    }
+
     /// Reads a model as [`Model::load`] does and prepares it for drawing: neighbours in space become neighbours in
     /// memory, so that whole clusters of them can be passed over, and SH bands that are 0 throughout are cut off.
     ///
@@ -140,10 +160,7 @@ impl Model {
     /// As [`Model::load`]; when there is no Gaussian to draw.
     pub fn load_for_drawing(path: &Path, console: &Console) -> Result<Self> {
         let mut model = Self::load(path, console)?;
-        if model.cloud.is_empty() {
-            return Err(Failure::new(format!("`{}` holds no Gaussian that can be drawn", model.path.display()))
-                .hint("the model is empty or all its values are broken: export or train it again"));
-        }
+        model.check_not_empty("drawn")?;
         let order: Vec<usize> = morton_order(&model.cloud.means).into_iter().map(|row| row as usize).collect();
         model.cloud = model.cloud.select(&order);
         let degree = model.cloud.highest_nonzero_degree();

@@ -3,7 +3,7 @@
 use super::device::ComputeDevice;
 use super::keeper::{self, Kept};
 use super::record::Recorder;
-use super::{layered, load_scene, log_machine, quality, scene_name};
+use super::{Model, layered, load_scene, log_machine, quality, scene_name};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, duration, grouped};
 use crate::diagnostics::{Failure, Result};
@@ -12,9 +12,11 @@ use crate::progress::{self, TrainProgress};
 use crate::report::{Figure, Measured, Report, html};
 use crate::run_dir::RunDir;
 use crate::settings::{self, Settings};
+use crate::terms::TermSection;
 use clap::Args;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Dataset, GaussianCloud};
+use gazesplat_fovea::hvsq::ReferenceCache;
 use gazesplat_render::Splats;
 use gazesplat_train::{Config, EvalReport, Outcome, Trainer, with_threads};
 use std::path::{Path, PathBuf};
@@ -30,6 +32,7 @@ Examples:
   gazesplat train my_capture --set train.steps=3000 --set data.max_side=480 --out runs/small
   gazesplat train my_capture --config my.toml --set train.seed=1
   gazesplat train my_capture --device gpu
+  gazesplat train my_capture --init runs/my_capture-1 --config finetune --set loss.hvsq.weight=100
 
 Ctrl-C stops after the current step and keeps what there is; a second Ctrl-C ends at once. A run
 that fails leaves its last good model in `unfinished.ply`; on a GPU copies go there on the way.")]
@@ -39,6 +42,9 @@ pub struct TrainArgs {
     /// Settings
     #[command(flatten)]
     pub settings: SettingsArgs,
+    /// Start from this model, a PLY file or the directory of a run, instead of the points of the scene
+    #[arg(long, value_name = "MODEL")]
+    pub init: Option<PathBuf>,
     /// Directory for the run [default: runs/SCENE-N]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
@@ -55,9 +61,12 @@ pub struct TrainArgs {
 /// # Errors
 /// When the scene, the settings, the device or the directory cannot be used, or the training fails.
 pub fn command(args: &TrainArgs, console: &Console) -> Result<()> {
-    let config = layered(Settings::new(), &args.settings)?.resolve()?;
+    let settings = layered(Settings::new(), &args.settings)?;
+    let (config, terms) = (settings.resolve()?, settings.resolve_terms()?);
     let device = &ComputeDevice::open(args.device.device, console)?;
-    let job = TrainJob { scene: &args.scene, config, out: args.out.as_deref(), overwrite: args.overwrite, device };
+    let init = args.init.as_deref().map(|path| Model::load_to_train(path, console)).transpose()?;
+    let (out, overwrite) = (args.out.as_deref(), args.overwrite);
+    let job = TrainJob { scene: &args.scene, config, terms, init, out, overwrite, device };
     train(&job, interrupt::stop_flag()?, console)?;
     Ok(())
 }
@@ -69,6 +78,10 @@ pub struct TrainJob<'a> {
     pub scene: &'a Path,
     /// Resolved settings.
     pub config: Config,
+    /// Terms of the loss that crate `train` knows nothing of.
+    pub terms: TermSection,
+    /// The model to start from; `None` = the points of the scene.
+    pub init: Option<Model>,
     /// The run directory; `None` = the next free `runs/<scene>-<n>`.
     pub out: Option<&'a Path>,
     /// Whether a run that is already in `out` is replaced.
@@ -114,7 +127,8 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         config.densify.cap,
         config.model.sh_degree
     );
-    tracing::debug!("all settings:\n{}", settings::to_toml(config));
+    let all_settings = settings::run_to_toml(config, &job.terms);
+    tracing::debug!("all settings:\n{all_settings}");
     let mut durations = Vec::new();
     let started = Instant::now();
     let dataset = load_scene(job.scene, config, console)?;
@@ -134,8 +148,15 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
     preload(&images, console)?;
-    let mut trainer =
-        job.device.guard(|| Ok(Trainer::new(&dataset, Arc::clone(&images), config, job.device.tensors())?))?;
+    let (mut trainer, cache) = job.device.guard(|| {
+        let (images, device) = (Arc::clone(&images), job.device.tensors());
+        let mut trainer = match &job.init {
+            Some(model) => Trainer::from_cloud(&model.cloud, &dataset, images, config, device)?,
+            None => Trainer::new(&dataset, images, config, device)?,
+        };
+        let cache = job.terms.loss.hvsq.register(&mut trainer)?;
+        Ok((trainer, cache))
+    })?;
     warnings.extend_from_slice(trainer.messages());
     let (measured, measured_images) = match dataset.test.is_empty() {
         false => (Measured::Test, Arc::clone(trainer.test_images())),
@@ -160,7 +181,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     if job.overwrite {
         run_dir.clear()?;
     }
-    run_dir.write_settings(config, job.scene, &job.device.describe())?;
+    run_dir.write_settings(&all_settings, job.scene, &job.device.describe())?;
     let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every, job.device.is_gpu());
     let mut bar = TrainProgress::new(console, config.train.steps);
     let started = Instant::now();
@@ -230,10 +251,10 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         views,
         scores: eval.views.iter().map(|v| (v.name.clone(), v.psnr, v.ssim)).collect(),
         film: Vec::new(),
-        facts: facts(job, &dataset, &run_dir),
+        facts: facts(job, &dataset, &run_dir, cache.as_deref()),
         durations,
         warnings,
-        settings: settings::to_toml(config),
+        settings: all_settings,
     };
     run_dir.write_report(&html::page(&report))?;
     console.note(format_args!(
@@ -277,7 +298,12 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
     }
 }
 
-fn facts(job: &TrainJob<'_>, dataset: &Dataset, run_dir: &RunDir) -> Vec<(String, String)> {
+fn facts(
+    job: &TrainJob<'_>,
+    dataset: &Dataset,
+    run_dir: &RunDir,
+    cache: Option<&ReferenceCache>,
+) -> Vec<(String, String)> {
     let mut facts = vec![
         ("scene".to_owned(), job.scene.display().to_string()),
         (
@@ -295,6 +321,13 @@ fn facts(job: &TrainJob<'_>, dataset: &Dataset, run_dir: &RunDir) -> Vec<(String
         facts.push(("model file".to_owned(), format!("point_cloud.ply, {}", bytes(file.len()))));
     }
     facts.push(("computed on".to_owned(), job.device.describe()));
+    if let Some(model) = &job.init {
+        facts.push(("started from".to_owned(), model.path.display().to_string()));
+    }
+    if let Some(cache) = cache {
+        // More than one per view: the cache is too small for the scene.
+        facts.push(("statistics of photographs".to_owned(), format!("computed {} times", cache.num_misses())));
+    }
     facts.push(("spherical harmonics".to_owned(), format!("degree {}", job.config.model.sh_degree)));
     facts
 }

@@ -3,6 +3,7 @@
 //! The tree is the serialised default [`Config`]: objects whose leaves are default values.
 
 use crate::diagnostics::nearest;
+use crate::terms::TermSection;
 use gazesplat_train::Config;
 use serde_json::Value as Json;
 use std::ops::Range;
@@ -62,7 +63,22 @@ impl Problem {
 
 /// The default settings as a tree of objects whose leaves are default values; `null` for "no default".
 pub(super) fn known_keys() -> Json {
-    serde_json::to_value(Config::default()).expect("settings are plain tables of numbers and text")
+    let tree = "settings are plain tables of numbers and text";
+    let mut keys = serde_json::to_value(Config::default()).expect(tree);
+    graft(&mut keys, serde_json::to_value(TermSection::default()).expect(tree));
+    keys
+}
+
+/// Adds the branches of `more` to `tree`.
+fn graft(tree: &mut Json, more: Json) {
+    match (tree, more) {
+        (Json::Object(tree), Json::Object(more)) => {
+            for (key, child) in more {
+                graft(tree.entry(key).or_insert(Json::Null), child);
+            }
+        }
+        (tree, more) => *tree = more,
+    }
 }
 
 pub(super) fn find<'a>(keys: &'a Json, path: &str) -> Option<&'a Json> {

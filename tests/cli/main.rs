@@ -7,6 +7,7 @@ mod demo;
 mod device;
 mod eval;
 mod help;
+mod hvsq;
 mod info;
 mod render;
 mod settings;

@@ -150,6 +150,50 @@ fn every_view_may_train() {
     assert!(!report.contains("Test views") && !report.contains("never saw"));
 }
 
+/// A model is gone on with, with HVSQ in the loss: what the records and the report say of it, and that it counts.
+#[test]
+fn model_is_fine_tuned_with_hvsq() {
+    let place = Place::with_run();
+    let tune = |out: &str, weight: &str| {
+        let weight = format!("loss.hvsq.weight={weight}");
+        let args = ["train", "scene", "--init", "run", "--config", "finetune", "--out", out];
+        place.run(&[&args[..], &["--set", "train.steps=20", "--set", &weight]].concat()).done();
+        place.read(&format!("{out}/metrics.jsonl"))
+    };
+    let [without, with] = [tune("without", "0"), tune("with", "100")].map(|log| {
+        let line = log.lines().last().expect("a line").to_owned();
+        serde_json::from_str::<Value>(&line).expect("JSON")
+    });
+    assert!(without["terms"].get("hvsq").is_none());
+    let hvsq = with["terms"]["hvsq"].as_f64().expect("the term is recorded");
+    assert!(hvsq > 0.0 && with["loss"].as_f64().expect("a loss") > 100.0 * hvsq);
+    let measured = |run: &str| {
+        let args = ["eval", run, "--scene", "scene", "--split", "train", "--hvsq", "3"];
+        let report: Value = serde_json::from_str(&place.run(&args).done().stdout).expect("JSON");
+        report["hvsq"]["mean"][0]["value"].as_f64().expect("a value")
+    };
+    let [before, without, with] = ["run", "without", "with"].map(measured);
+    assert!(with < before && with < without, "{before:e} before, {without:e} without the term, {with:e} with it");
+    let settings = place.read("with/settings.toml");
+    assert!(settings.contains("[loss.hvsq]\nweight = 100.0\npooling_px = 3.0\n"), "{settings}");
+    let report = place.read("with/report.html");
+    assert!(report.contains("<th>started from</th><td>run/point_cloud.ply</td>"));
+    assert!(report.contains("<th>statistics of photographs</th><td>computed 7 times</td>"), "once per view");
+}
+
+#[test]
+fn impossible_beginnings_and_terms_are_refused() {
+    let place = Place::with_scene();
+    let said = train(&place, &["--init", "nowhere.ply"]).refused();
+    assert!(said.contains("nowhere.ply"), "{said}");
+    let said = train(&place, &["--set", "loss.hvsq.weight=1", "--set", "loss.hvsq.pooling_px=0.5"]).refused();
+    assert!(said.contains("`loss.hvsq.pooling_px`: found 0.5, expected a number of pixels from 1 on"), "{said}");
+    let said = train(&place, &["--set", "loss.hvsq.weight=1", "--set", "loss.hvsq.pooling_px=65"]).refused();
+    assert!(said.contains("`loss.hvsq.pooling_px` and the photograph") && said.contains("at most 64"), "{said}");
+    let said = train(&place, &["--set", "loss.hvsq.wieght=1"]).refused();
+    assert!(said.contains("did you mean `loss.hvsq.weight`?"), "{said}");
+}
+
 #[cfg(unix)]
 #[test]
 fn interrupt_saves_what_there_is() {

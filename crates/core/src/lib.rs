@@ -7,8 +7,10 @@
 pub mod camera;
 pub mod color;
 pub mod dataset;
+pub mod display;
 pub mod error;
 pub mod gaussian_cloud;
+pub mod gaze;
 pub mod image;
 pub mod io;
 pub mod rng;
@@ -18,7 +20,9 @@ pub mod view;
 
 pub use camera::{Camera, Pinhole};
 pub use dataset::{Dataset, SparsePoints};
+pub use display::{Display, PixelGrid};
 pub use error::{Error, Result};
 pub use gaussian_cloud::GaussianCloud;
+pub use gaze::Gaze;
 pub use image::{ImageF32, RgbImage8};
 pub use view::View;

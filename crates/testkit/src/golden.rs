@@ -101,13 +101,20 @@ fn list_in(dirs: &[PathBuf], prefix: &str) -> Vec<GoldenFile> {
 }
 
 impl GoldenFile {
+    /// Reads the scalars alone, of a record that has no arrays.
+    ///
+    /// # Panics
+    /// If the file is missing or damaged, naming it.
+    pub fn load_json(&self) -> Value {
+        serde_json::from_slice(&read(&self.json)).unwrap_or_else(|e| panic!("{}: {e}", self.json.display()))
+    }
+
     /// Reads the record.
     ///
     /// # Panics
     /// If a file is missing or damaged, naming it: golden data that cannot be read is a failed test.
     pub fn load(&self) -> Golden {
-        let json = read(&self.json);
-        let json = serde_json::from_slice(&json).unwrap_or_else(|e| panic!("{}: {e}", self.json.display()));
+        let json = self.load_json();
         let path = self.json.with_extension("safetensors");
         let arrays = parse(&read(&path)).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
         Golden { stem: self.stem.clone(), json, arrays }

@@ -5,6 +5,7 @@
 //! of this function ([`crate::finite_diff`]) give them to about ten digits away from branches.
 
 mod composite;
+pub mod hvsq;
 mod project;
 
 pub use composite::render;

@@ -1,0 +1,5 @@
+//! The passes on the CPU.
+
+pub mod hvsq;
+pub mod pooling;
+pub mod pyramid;

@@ -1,0 +1,150 @@
+//! Terms of the training loss and guards of pruning that crate `train` knows nothing of: what they are called, their
+//! settings, and how they are made. This is where models of vision meet the trainer.
+
+use crate::diagnostics::{Failure, Result};
+use gazesplat_fovea::Hvsq;
+use gazesplat_fovea::hvs::pooling::Pooling;
+use gazesplat_fovea::hvsq::{Distance, HvsqLoss, HvsqMetric, ReferenceCache};
+use gazesplat_train::Trainer;
+use gazesplat_train::metrics::{Bound, Guard};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// The section of [`TermSection`] that is registered as a loss, as in settings files.
+pub const HVSQ_LOSS: &str = "loss.hvsq";
+
+/// Settings of the terms that this program adds to those of training.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TermSection {
+    /// Terms of the loss.
+    pub loss: LossTerms,
+}
+
+/// Terms of the loss by name.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LossTerms {
+    /// Statistics of early vision over pools of pixels (RTGS Eq. 2).
+    pub hvsq: HvsqTerm,
+}
+
+/// HVSQ as a term of the loss.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct HvsqTerm {
+    /// Weight beside the other terms; 0 = not computed. HVSQ of L1 distances is about a hundredth of L1 + SSIM. Default 0.
+    pub weight: f32,
+    /// Side of the pools in pixels, at least 1 and at most the shorter side of the images. Default 3.
+    pub pooling_px: f64,
+    /// `"l1"` or `"mse"`. Default `"l1"` (training as in RTGS).
+    pub distance: TermDistance,
+    /// Megabytes of statistics of photographs that are kept. Default 512.
+    pub cache_mb: usize,
+}
+
+/// Distance between two statistics.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TermDistance {
+    /// Absolute difference.
+    #[default]
+    L1,
+    /// Squared difference.
+    Mse,
+}
+
+impl Default for HvsqTerm {
+    fn default() -> Self {
+        Self { weight: 0.0, pooling_px: 3.0, distance: TermDistance::default(), cache_mb: 512 }
+    }
+}
+
+impl HvsqTerm {
+    /// Whether the loss has this term.
+    pub fn is_used(&self) -> bool {
+        self.weight != 0.0
+    }
+
+    fn refuse(key: &str, found: impl std::fmt::Display, expected: &str) -> Failure {
+        Failure::new(format!("`{HVSQ_LOSS}.{key}`: found {found}, expected {expected}"))
+            .hint(format!("for example `--set {HVSQ_LOSS}.{key}={}`", if key == "weight" { "100" } else { "3" }))
+    }
+
+    /// Checks every range that does not depend on images.
+    ///
+    /// # Errors
+    /// Naming the first key that is out of its range.
+    pub fn validate(&self) -> Result<()> {
+        if !(self.weight >= 0.0 && self.weight.is_finite()) {
+            return Err(Self::refuse("weight", self.weight, "a number of at least 0"));
+        }
+        if !(self.pooling_px >= 1.0 && self.pooling_px.is_finite()) {
+            return Err(Self::refuse("pooling_px", self.pooling_px, "a number of pixels from 1 on"));
+        }
+        Ok(())
+    }
+
+    /// Adds the term to what `trainer` minimises, if it has a weight; the cache that its statistics are kept in.
+    ///
+    /// # Errors
+    /// When the pools are larger than a photograph.
+    pub fn register(&self, trainer: &mut Trainer) -> Result<Option<Arc<ReferenceCache>>> {
+        if !self.is_used() {
+            return Ok(None);
+        }
+        self.validate()?;
+        let distance = match self.distance {
+            TermDistance::L1 => Distance::L1,
+            TermDistance::Mse => Distance::Mse,
+        };
+        let hvsq = Hvsq::new(Pooling::Uniform { size_px: self.pooling_px }, distance)?;
+        for view in trainer.images().views() {
+            let pinhole = view.camera.intrinsics;
+            hvsq.check_size((pinhole.width as usize, pinhole.height as usize)).map_err(|error| {
+                Failure::new(format!("`{HVSQ_LOSS}.pooling_px` and the photograph `{}`: {error}", view.name))
+                    .hint("choose smaller pools, or larger images with `data.max_side`")
+            })?;
+        }
+        let cache = Arc::new(ReferenceCache::new(hvsq, self.cache_mb.saturating_mul(1 << 20)));
+        trainer.add_loss(self.weight, Box::new(HvsqLoss::new(Arc::clone(&cache))));
+        Ok(Some(cache))
+    }
+}
+
+/// A guard that holds HVSQ (squared differences, over uniform pools of `pooling_px`) at or below `bound`: `guard.hvsq`.
+///
+/// # Errors
+/// When the pools are no number of pixels from 1 on.
+pub fn hvsq_guard(pooling_px: f64, bound: f64, cache_bytes: usize) -> Result<Guard> {
+    let hvsq = Hvsq::new(Pooling::Uniform { size_px: pooling_px }, Distance::Mse)?;
+    let cache = Arc::new(ReferenceCache::new(hvsq, cache_bytes));
+    Ok(Guard::default().with(Box::new(HvsqMetric::new(cache)), Bound::AtMost(bound)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_are_checked_by_key() {
+        HvsqTerm::default().validate().expect("defaults are valid");
+        for (term, key) in [
+            (HvsqTerm { weight: -1.0, ..HvsqTerm::default() }, "`loss.hvsq.weight`: found -1"),
+            (HvsqTerm { weight: f32::NAN, ..HvsqTerm::default() }, "`loss.hvsq.weight`: found NaN"),
+            (HvsqTerm { pooling_px: 0.5, ..HvsqTerm::default() }, "`loss.hvsq.pooling_px`: found 0.5"),
+            (HvsqTerm { pooling_px: f64::INFINITY, ..HvsqTerm::default() }, "`loss.hvsq.pooling_px`: found inf"),
+        ] {
+            let said = format!("{:?}", term.validate().expect_err("must be refused"));
+            assert!(said.contains(key), "{said}");
+        }
+    }
+
+    #[test]
+    fn a_guard_names_its_pools_and_holds_up_to_its_bound() {
+        let guard = hvsq_guard(3.0, 0.25, 1 << 20).expect("valid");
+        assert_eq!(guard.bounds().collect::<Vec<_>>(), [("hvsq@3", Bound::AtMost(0.25))]);
+        assert!(guard.holds(&[vec![0.25]]) && !guard.holds(&[vec![0.26]]) && !guard.holds(&[vec![f64::NAN]]));
+        assert!(hvsq_guard(0.5, 0.25, 1 << 20).is_err());
+    }
+}

@@ -1,6 +1,6 @@
 //! The command line: what is accepted, explained, and which command it becomes. Nothing is opened here.
 
-use crate::commands::{bench, demo, eval, hvsq, info, lut, render, synth, train};
+use crate::commands::{bench, demo, eval, hvsq, info, lut, prune, render, synth, train};
 use crate::console::Console;
 use crate::diagnostics::Result;
 use crate::settings;
@@ -57,6 +57,8 @@ pub struct Verbosity {
 pub enum Command {
     /// Train a Gaussian model on the photographs of a scene
     Train(train::TrainArgs),
+    /// Make a model several times faster to draw at a quality that is held
+    Prune(Box<prune::PruneArgs>),
     /// Measure a model against the photographs of a scene: PSNR and SSIM
     Eval(eval::EvalArgs),
     /// Measure how different two pictures look in the corner of the eye
@@ -82,18 +84,22 @@ pub enum Command {
 /// # Errors
 /// Whatever the command fails with.
 pub fn run() -> Result<()> {
-    let keys = format!("Settings for --set and --config, with their defaults:\n{}", settings::describe_keys());
-    let with_keys = |c: clap::Command| {
-        let examples = c.get_after_help().map(ToString::to_string).unwrap_or_default();
-        c.after_long_help(format!("{examples}\n\n{keys}"))
+    let with_keys = |schema: &'static settings::Schema| {
+        move |c: clap::Command| {
+            let examples = c.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let keys = settings::describe_keys(schema);
+            c.after_long_help(format!("{examples}\n\nSettings for --set and --config, with their defaults:\n{keys}"))
+        }
     };
-    let matches = Cli::command().mut_subcommand("train", with_keys).get_matches();
+    let command = Cli::command().mut_subcommand("train", with_keys(&settings::TRAIN));
+    let matches = command.mut_subcommand("prune", with_keys(&settings::PRUNE)).get_matches();
     let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|e| e.exit());
     start_log(cli.verbosity);
     let console = Console::new(cli.verbosity.quiet);
     let console = if cli.verbosity.verbose > 0 { console.without_bars() } else { console };
     match cli.command {
         Command::Train(args) => train::command(&args, &console),
+        Command::Prune(args) => prune::command(&args, &console),
         Command::Eval(args) => eval::command(&args, &console),
         Command::Hvsq(args) => hvsq::command(&args, &console),
         Command::Render(args) => render::command(&args, &console),

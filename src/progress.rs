@@ -38,8 +38,8 @@ impl<'a> TrainProgress<'a> {
         Self { console, bar, num_steps, window_start: (now, 0), steps_per_sec: None, last_line: now, loss: None }
     }
 
-    fn step(&mut self, report: &StepReport) {
-        let done = report.step;
+    /// Tells that `done` steps are done, `report` being of the last.
+    pub fn step(&mut self, done: u32, report: &StepReport) {
         // A GPU reads the loss of some steps only: one stands for those since the last.
         if let Some(loss) = report.losses.as_ref().map(|losses| losses.total) {
             let (mean, fed) = self.loss.unwrap_or((loss, done));
@@ -84,7 +84,7 @@ impl Observer for TrainProgress<'_> {
     fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         match event {
             TrainEvent::Started { .. } => self.window_start = (Instant::now(), 0),
-            TrainEvent::Step(report) => self.step(report),
+            TrainEvent::Step(report) => self.step(report.step, report),
             TrainEvent::Evaluated { step, report } => {
                 self.console.note(format_args!(
                     "step {step}: {:.2} dB PSNR, {:.3} SSIM on {} test views",

@@ -197,7 +197,7 @@ impl Drop for RunDir {
 const MODEL: &str = "point_cloud.ply";
 
 /// Removes a file that may not be there.
-fn remove(file: &Path) -> Result<()> {
+pub(crate) fn remove(file: &Path) -> Result<()> {
     match fs::remove_file(file) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(cannot_write(file, e)),
         _ => Ok(()),

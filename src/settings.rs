@@ -1,39 +1,55 @@
 //! Settings in layers: defaults, a preset or TOML file, then `--set key=value`, the later one winning.
 //!
 //! A key that does not exist is refused with the nearest one that does, a value of the wrong type with what was
-//! expected; for files the place is shown. The tree of known keys is the serialised default [`Config`], with the terms that
-//! only this program knows ([`TermSection`]) grown into it, so nothing here names a key and nothing can fall behind.
+//! expected; for files the place is shown. The tree of known keys is the serialised default of what a command is set by
+//! ([`Schema`]), so nothing here names a key and nothing can fall behind.
 
 mod keys;
+mod schema;
 
 pub use keys::describe_keys;
+pub use schema::{PRUNE, Schema, TRAIN};
 
 use crate::diagnostics::{Failure, Result};
-use crate::terms::TermSection;
+use crate::terms::{PruneTerms, TermSection};
 use gazesplat_train::Config;
-use keys::{Problem, check_table, find, known_keys, unknown_key};
+use gazesplat_train::prune::PruneConfig;
+use keys::{Problem, check_table, find, unknown_key};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use serde_json::Value as Json;
 use std::path::Path;
 use toml::Table;
 use toml::de::DeTable;
 
-/// Presets that come with the program, by name: each holds only what differs from the defaults.
-pub const PRESETS: [(&str, &str); 3] = [
-    ("quick", include_str!("../configs/train/quick.toml")),
-    ("quality", include_str!("../configs/train/quality.toml")),
-    ("finetune", include_str!("../configs/train/finetune.toml")),
-];
-
 /// The values given so far, without the defaults.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Settings {
     table: Table,
+    schema: &'static Schema,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self::new()
+    }
 }
 
 impl Settings {
-    /// No value given: all defaults.
+    /// Settings of training, no value given: all defaults.
     pub fn new() -> Self {
-        Self::default()
+        Self::of(&TRAIN)
+    }
+
+    /// Settings of `schema`, no value given: all defaults.
+    pub fn of(schema: &'static Schema) -> Self {
+        Self { table: Table::new(), schema }
+    }
+
+    /// Settings of `schema` with the values given so far in `sections`, which both have.
+    pub fn carried_to(&self, schema: &'static Schema, sections: &[&str]) -> Self {
+        let carried = self.table.iter().filter(|(key, _)| sections.contains(&key.as_str()));
+        Self { table: carried.map(|(key, value)| (key.clone(), value.clone())).collect(), schema }
     }
 
     /// Layers a preset (`quick`) or a TOML file over the values so far; an existing file wins over a preset of that name.
@@ -41,7 +57,7 @@ impl Settings {
     /// # Errors
     /// When there is neither such a file nor such a preset, when it is no TOML, or holds an unknown key or a wrong value.
     pub fn with_config(self, name_or_path: &Path) -> Result<Self> {
-        let preset = PRESETS.iter().find(|(name, _)| Path::new(name) == name_or_path);
+        let preset = self.schema.presets.iter().find(|(name, _)| Path::new(name) == name_or_path);
         match preset {
             Some((name, text)) if !name_or_path.exists() => self.with_text(Path::new(&format!("preset {name}")), text),
             _ => self.with_file(name_or_path),
@@ -56,7 +72,7 @@ impl Settings {
         let text = std::fs::read_to_string(path).map_err(|e| {
             Failure::io("read", path, e).hint(format!(
                 "give a TOML file or one of the presets {}",
-                PRESETS.map(|(name, _)| format!("`{name}`")).join(", ")
+                self.schema.presets.iter().map(|(name, _)| format!("`{name}`")).collect::<Vec<_>>().join(", ")
             ))
         })?;
         self.with_text(path, &text)
@@ -71,15 +87,10 @@ impl Settings {
             }
         };
         let document = DeTable::parse(text).map_err(|e| at(Problem::from_toml(&e)))?;
-        check_table(document.get_ref(), &known_keys(), "").map_err(&at)?;
+        check_table(document.get_ref(), &self.schema.known_keys(), self.schema, "").map_err(&at)?;
         // A second reading by the types themselves: names of variants, ranges of integers.
         let layer: Table = toml::from_str(text).map_err(|e| at(Problem::from_toml(&e)))?;
-        if split(layer.clone()).1.is_empty() {
-            // By the text, so that the place of what is wrong can be shown.
-            toml::from_str::<Config>(text).map_err(|e| at(Problem::from_toml(&e).of_value("", &Json::Null)))?;
-        } else {
-            read(layer.clone()).map_err(|e| at(Problem::from_toml(&e).of_value("", &Json::Null)))?;
-        }
+        self.schema.check(&layer, Some(text)).map_err(|e| at(Problem::from_toml(&e).of_value("", &Json::Null)))?;
         merge(&mut self.table, layer);
         Ok(self)
     }
@@ -92,13 +103,15 @@ impl Settings {
         let refuse =
             |problem: Problem| Failure::new(format!("`--set {assignment}`: {}", problem.message)).hint_if(problem.hint);
         let Some((key, raw)) = assignment.split_once('=') else {
-            return Err(refuse(Problem::new("expected `key=value`").hint("for example `--set train.steps=3000`")));
+            return Err(refuse(
+                Problem::new("expected `key=value`").hint(format!("for example `--set {}`", self.schema.example)),
+            ));
         };
         let (key, raw) = (key.trim(), raw.trim());
-        let keys = known_keys();
+        let keys = self.schema.known_keys();
         let is_key = !key.is_empty() && key.chars().all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.'));
         if !is_key || find(&keys, key).is_none_or(Json::is_object) {
-            return Err(refuse(unknown_key(key, &keys)));
+            return Err(refuse(unknown_key(key, &keys, self.schema)));
         }
         let quoted = toml::Value::String(raw.to_owned()).to_string();
         let readings = [raw.to_owned(), quoted, format!("[{raw}]")];
@@ -119,9 +132,9 @@ impl Settings {
     fn with_assignment(&self, key: &str, value: &str, keys: &Json) -> std::result::Result<Self, Problem> {
         let text = format!("{key} = {value}\n");
         let document = DeTable::parse(&text).map_err(|e| Problem::from_toml(&e))?;
-        check_table(document.get_ref(), keys, "")?;
+        check_table(document.get_ref(), keys, self.schema, "")?;
         let layer: Table = toml::from_str(&text).map_err(|e| Problem::from_toml(&e))?;
-        read(layer.clone()).map_err(|e| Problem::from_toml(&e).of_value(key, keys))?;
+        self.schema.check(&layer, None).map_err(|e| Problem::from_toml(&e).of_value(key, keys))?;
         let mut next = self.clone();
         merge(&mut next.table, layer);
         Ok(next)
@@ -140,7 +153,7 @@ impl Settings {
     /// # Errors
     /// When the values contradict each other or are out of their range.
     pub fn resolve(&self) -> Result<Config> {
-        let (config, _) = read(self.table.clone()).map_err(|e| Failure::new(e.message().to_owned()))?;
+        let (config, _): (Config, TermSection) = self.read()?;
         config.validate()?;
         Ok(config)
     }
@@ -150,44 +163,35 @@ impl Settings {
     /// # Errors
     /// When a value is out of its range.
     pub fn resolve_terms(&self) -> Result<TermSection> {
-        let (_, terms) = read(self.table.clone()).map_err(|e| Failure::new(e.message().to_owned()))?;
+        let (_, terms): (Config, TermSection) = self.read()?;
         terms.loss.hvsq.validate()?;
         Ok(terms)
     }
-}
 
-/// What of a table belongs to crate `train`, and what to the terms of this program: the tables that [`TermSection`] has in
-/// the sections of [`Config`].
-fn split(mut table: Table) -> (Table, Table) {
-    let known = Table::try_from(TermSection::default()).expect("settings are plain tables of numbers and text");
-    let mut terms = Table::new();
-    for (section, known) in &known {
-        let (Some(toml::Value::Table(found)), toml::Value::Table(known)) = (table.get_mut(section), known) else {
-            continue;
-        };
-        let own: Table = known.keys().filter_map(|key| found.remove_entry(key)).collect();
-        if !own.is_empty() {
-            terms.insert(section.clone(), own.into());
-        }
+    /// As [`Settings::resolve`] and [`Settings::resolve_terms`], for pruning.
+    ///
+    /// # Errors
+    /// When the values contradict each other or are out of their range.
+    pub fn resolve_pruning(&self) -> Result<(PruneConfig, PruneTerms)> {
+        let (config, terms): (PruneConfig, PruneTerms) = self.read()?;
+        config.validate()?;
+        terms.validate()?;
+        Ok((config, terms))
     }
-    (table, terms)
-}
 
-/// Both parts of a table by their types.
-fn read(table: Table) -> std::result::Result<(Config, TermSection), toml::de::Error> {
-    let (config, terms) = split(table);
-    Ok((config.try_into()?, terms.try_into()?))
+    fn read<C: DeserializeOwned, T: DeserializeOwned + Default + Serialize>(&self) -> Result<(C, T)> {
+        schema::read(self.table.clone()).map_err(|e| Failure::new(e.message().to_owned()))
+    }
 }
 
 /// The resolved settings as TOML, every key present that has a value.
-pub fn to_toml(config: &Config) -> String {
+pub fn to_toml(config: &impl Serialize) -> String {
     toml::to_string_pretty(config).expect("settings are plain tables of numbers and text")
 }
 
 /// The resolved settings of a run with its terms as TOML.
-pub fn run_to_toml(config: &Config, terms: &TermSection) -> String {
-    let terms = toml::to_string_pretty(terms).expect("settings are plain tables of numbers and text");
-    format!("{}\n{terms}", to_toml(config))
+pub fn run_to_toml(config: &impl Serialize, terms: &impl Serialize) -> String {
+    format!("{}\n{}", to_toml(config), to_toml(terms))
 }
 
 fn merge(base: &mut Table, layer: Table) {
@@ -267,10 +271,36 @@ mod tests {
     #[test]
     fn presets_are_valid_and_differ_from_the_defaults() {
         let defaults = to_toml(&Config::default());
-        for (name, text) in PRESETS {
+        for (name, text) in TRAIN.presets {
             let config = Settings::new().with_text(Path::new(name), text).and_then(|s| s.resolve()).expect(name);
             assert_ne!(to_toml(&config), defaults, "{name} changes nothing");
         }
+    }
+
+    #[test]
+    fn presets_of_pruning_are_those_of_the_specification() {
+        let resolved = |preset: &str| {
+            let settings = Settings::of(&PRUNE).with_config(Path::new(preset)).expect(preset);
+            settings.resolve_pruning().expect(preset).0
+        };
+        let (quick, paper) = (resolved("quick"), resolved("paper"));
+        assert_eq!(quick, PruneConfig::default());
+        let plan = paper.plan();
+        assert_eq!((plan.reference, plan.prune, plan.adapt, plan.event_every), (5000, 45_000, 5000, 1000));
+        assert_eq!((plan.opacity_clamp, paper.prune.final_clamp), (0.1, true));
+        assert_eq!(paper.guard.views, gazesplat_train::prune::GuardViews::Test);
+        let misspelt = Settings::of(&PRUNE).with_override("prune.bugdet=1").expect_err("unknown");
+        assert!(format!("{misspelt:?}").contains("did you mean `prune.budget`?"), "{misspelt:?}");
+        let of_training = Settings::of(&PRUNE).with_override("densify.cap=1").expect_err("unknown");
+        assert!(format!("{of_training:?}").contains("`densify.cap` is not a setting"), "{of_training:?}");
+    }
+
+    #[test]
+    fn sections_that_two_commands_share_are_carried_over() {
+        let run = Settings::new().with_overrides(&["data.max_side=320".to_owned(), "train.steps=7".to_owned()]);
+        let carried = run.expect("valid").carried_to(&PRUNE, &["data", "render"]);
+        let (config, _) = carried.resolve_pruning().expect("valid");
+        assert_eq!(config.data.max_side, 320);
     }
 
     #[test]

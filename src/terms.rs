@@ -2,10 +2,12 @@
 //! settings, and how they are made. This is where models of vision meet the trainer.
 
 use crate::diagnostics::{Failure, Result};
+use gazesplat_core::View;
 use gazesplat_fovea::Hvsq;
 use gazesplat_fovea::hvs::pooling::Pooling;
 use gazesplat_fovea::hvsq::{Distance, HvsqLoss, HvsqMetric, ReferenceCache};
 use gazesplat_train::Trainer;
+use gazesplat_train::losses::ImageLoss;
 use gazesplat_train::metrics::{Bound, Guard};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -90,6 +92,16 @@ impl HvsqTerm {
     /// # Errors
     /// When the pools are larger than a photograph.
     pub fn register(&self, trainer: &mut Trainer) -> Result<Option<Arc<ReferenceCache>>> {
+        let Some((loss, cache)) = self.make(trainer.images().views())? else { return Ok(None) };
+        trainer.add_loss(self.weight, loss);
+        Ok(Some(cache))
+    }
+
+    /// The term for the photographs of `views`, if it has a weight, and the cache that its statistics are kept in.
+    ///
+    /// # Errors
+    /// When the pools are larger than a photograph.
+    pub fn make(&self, views: &[View]) -> Result<Option<(Box<dyn ImageLoss>, Arc<ReferenceCache>)>> {
         if !self.is_used() {
             return Ok(None);
         }
@@ -99,7 +111,7 @@ impl HvsqTerm {
             TermDistance::Mse => Distance::Mse,
         };
         let hvsq = Hvsq::new(Pooling::Uniform { size_px: self.pooling_px }, distance)?;
-        for view in trainer.images().views() {
+        for view in views {
             let pinhole = view.camera.intrinsics;
             hvsq.check_size((pinhole.width as usize, pinhole.height as usize)).map_err(|error| {
                 Failure::new(format!("`{HVSQ_LOSS}.pooling_px` and the photograph `{}`: {error}", view.name))
@@ -107,19 +119,88 @@ impl HvsqTerm {
             })?;
         }
         let cache = Arc::new(ReferenceCache::new(hvsq, self.cache_mb.saturating_mul(1 << 20)));
-        trainer.add_loss(self.weight, Box::new(HvsqLoss::new(Arc::clone(&cache))));
-        Ok(Some(cache))
+        Ok(Some((Box::new(HvsqLoss::new(Arc::clone(&cache))), cache)))
     }
 }
 
-/// A guard that holds HVSQ (squared differences, over uniform pools of `pooling_px`) at or below `bound`: `guard.hvsq`.
+/// Settings of the terms that this program adds to those of pruning.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PruneTerms {
+    /// Terms of the loss.
+    pub loss: LossTerms,
+    /// Bounds beside those of PSNR and SSIM.
+    pub guard: GuardTerms,
+}
+
+/// Bounds by name.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GuardTerms {
+    /// Statistics of early vision over pools of pixels (RTGS Eq. 2).
+    pub hvsq: HvsqBound,
+}
+
+/// HVSQ as a bound.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct HvsqBound {
+    /// Mean HVSQ of squared differences that the guard's views may have; 0 = it is not measured. Default 0.
+    pub at_most: f64,
+    /// Side of the pools in pixels, at least 1. Default 3.
+    pub pooling_px: f64,
+    /// Megabytes of statistics of photographs that are kept. Default 512.
+    pub cache_mb: usize,
+}
+
+impl Default for HvsqBound {
+    fn default() -> Self {
+        Self { at_most: 0.0, pooling_px: 3.0, cache_mb: 512 }
+    }
+}
+
+impl PruneTerms {
+    /// Checks every range that does not depend on images.
+    ///
+    /// # Errors
+    /// Naming the first key that is out of its range.
+    pub fn validate(&self) -> Result<()> {
+        self.loss.hvsq.validate()?;
+        let HvsqBound { at_most, pooling_px, .. } = self.guard.hvsq;
+        let refuse = |key: &str, found: f64, expected: &str| {
+            Err(Failure::new(format!("`guard.hvsq.{key}`: found {found}, expected {expected}")))
+        };
+        if !(at_most >= 0.0 && at_most.is_finite()) {
+            return refuse("at_most", at_most, "a number of at least 0");
+        }
+        if !(pooling_px >= 1.0 && pooling_px.is_finite()) {
+            return refuse("pooling_px", pooling_px, "a number of pixels from 1 on");
+        }
+        Ok(())
+    }
+}
+
+impl HvsqBound {
+    /// `guard` with this bound, if it is one.
+    ///
+    /// # Errors
+    /// As [`hvsq_metric`].
+    pub fn add_to(&self, guard: Guard) -> Result<Guard> {
+        if self.at_most == 0.0 {
+            return Ok(guard);
+        }
+        let metric = hvsq_metric(self.pooling_px, self.cache_mb.saturating_mul(1 << 20))?;
+        Ok(guard.with(Box::new(metric), Bound::AtMost(self.at_most)))
+    }
+}
+
+/// HVSQ (squared differences, over uniform pools of `pooling_px`) as a metric.
 ///
 /// # Errors
 /// When the pools are no number of pixels from 1 on.
-pub fn hvsq_guard(pooling_px: f64, bound: f64, cache_bytes: usize) -> Result<Guard> {
+fn hvsq_metric(pooling_px: f64, cache_bytes: usize) -> Result<HvsqMetric> {
     let hvsq = Hvsq::new(Pooling::Uniform { size_px: pooling_px }, Distance::Mse)?;
-    let cache = Arc::new(ReferenceCache::new(hvsq, cache_bytes));
-    Ok(Guard::default().with(Box::new(HvsqMetric::new(cache)), Bound::AtMost(bound)))
+    Ok(HvsqMetric::new(Arc::new(ReferenceCache::new(hvsq, cache_bytes))))
 }
 
 #[cfg(test)]
@@ -142,9 +223,17 @@ mod tests {
 
     #[test]
     fn a_guard_names_its_pools_and_holds_up_to_its_bound() {
-        let guard = hvsq_guard(3.0, 0.25, 1 << 20).expect("valid");
+        let bound = |at_most, pooling_px| HvsqBound { at_most, pooling_px, cache_mb: 1 };
+        let guard = bound(0.25, 3.0).add_to(Guard::default()).expect("valid");
         assert_eq!(guard.bounds().collect::<Vec<_>>(), [("hvsq@3", Bound::AtMost(0.25))]);
         assert!(guard.holds(&[vec![0.25]]) && !guard.holds(&[vec![0.26]]) && !guard.holds(&[vec![f64::NAN]]));
-        assert!(hvsq_guard(0.5, 0.25, 1 << 20).is_err());
+        assert!(bound(0.25, 0.5).add_to(Guard::default()).is_err());
+        assert_eq!(bound(0.0, 3.0).add_to(Guard::default()).expect("valid").bounds().count(), 0);
+        let terms = |at_most, pooling_px| PruneTerms {
+            guard: GuardTerms { hvsq: bound(at_most, pooling_px) },
+            ..PruneTerms::default()
+        };
+        terms(0.0, 3.0).validate().expect("the defaults are valid");
+        assert!(terms(f64::NAN, 3.0).validate().is_err() && terms(0.1, 0.9).validate().is_err());
     }
 }

@@ -8,6 +8,7 @@ pub mod hvsq;
 pub mod hvsq_args;
 pub mod info;
 pub mod lut;
+pub mod prune;
 pub mod render;
 pub mod synth;
 pub mod termination;
@@ -181,12 +182,18 @@ impl Model {
     /// # Errors
     /// When a settings file or value is wrong.
     pub fn settings(&self, args: &SettingsArgs) -> Result<Config> {
-        let file = self.run.as_ref().map(RunDir::settings_path).filter(|p| p.is_file());
-        let settings = match &file {
-            Some(file) => Settings::new().with_file(file)?,
-            None => Settings::new(),
-        };
-        layered(settings, args)?.resolve()
+        layered(self.run_settings()?, args)?.resolve()
+    }
+
+    /// The settings of its run, if it was given as one; else none.
+    ///
+    /// # Errors
+    /// When the settings file is wrong.
+    pub fn run_settings(&self) -> Result<Settings> {
+        match self.run.as_ref().map(RunDir::settings_path).filter(|p| p.is_file()) {
+            Some(file) => Settings::new().with_file(&file),
+            None => Ok(Settings::new()),
+        }
     }
 }
 

@@ -250,6 +250,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         test_psnr,
         views,
         scores: eval.views.iter().map(|v| (v.name.clone(), v.psnr, v.ssim)).collect(),
+        sections: Vec::new(),
         film: Vec::new(),
         facts: facts(job, &dataset, &run_dir, cache.as_deref()),
         durations,

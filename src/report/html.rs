@@ -23,6 +23,7 @@ pub fn page(report: &Report) -> String {
     header(&mut body, report);
     film(&mut body, report);
     views(&mut body, report);
+    sections(&mut body, report);
     curves(&mut body, report);
     timings(&mut body, report);
     details(&mut body, report);
@@ -98,6 +99,33 @@ fn views(out: &mut String, report: &Report) {
     }
     put!(out, "<p class=\"legend\"><i style=\"background:{}\"></i>", pictures::heat_gradient());
     put!(out, "absolute difference, 0 to {ERROR_SCALE} of full scale and above</p></section>\n");
+}
+
+fn sections(out: &mut String, report: &Report) {
+    for section in &report.sections {
+        put!(out, "<section><h2>{}</h2><p>{}</p>", escape(&section.heading), escape(&section.text));
+        if !section.plots.is_empty() {
+            put!(out, "<div class=\"plots\">");
+            for (caption, svg) in &section.plots {
+                put!(out, "<figure><figcaption><b>{}</b></figcaption>{svg}</figure>", escape(caption));
+            }
+            put!(out, "</div>");
+        }
+        for row in &section.rows {
+            put!(out, "<figure><div class=\"{}\">", if row.pictures.len() == 3 { "triple" } else { "pair" });
+            for (tag, image) in &row.pictures {
+                let (tag, uri) = (escape(tag), pictures::data_uri(image, QUALITY));
+                put!(out, "<div class=\"cell\"><img loading=\"lazy\" alt=\"{tag}\" src=\"{uri}\">");
+                put!(out, "<em class=\"tag\">{tag}</em></div>");
+            }
+            put!(out, "</div><figcaption>{}</figcaption></figure>\n", escape(&row.caption));
+        }
+        if !section.legend.is_empty() {
+            put!(out, "<p class=\"legend\"><i style=\"background:{}\"></i>", pictures::heat_gradient());
+            put!(out, "{}</p>", escape(&section.legend));
+        }
+        put!(out, "</section>\n");
+    }
 }
 
 fn caption(view: &ViewPanel) -> String {
@@ -224,7 +252,7 @@ fn details(out: &mut String, report: &Report) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::report::{Figure, StepPoint};
+    use crate::report::{Figure, PictureRow, Section, StepPoint};
     use gazesplat_core::RgbImage8;
 
     fn sample() -> Report {
@@ -240,6 +268,13 @@ mod tests {
             test_psnr: vec![(100, 20.0), (200, 25.0)],
             stages: vec![("forward".into(), 3.0), ("backward".into(), 5.0)],
             views: vec![view("a.png"), view("b.png")],
+            sections: vec![Section {
+                heading: "Latency & work".into(),
+                plots: vec![("points".into(), "<svg></svg>".into())],
+                rows: vec![PictureRow { caption: "c".into(), pictures: vec![("load".into(), gray(3))] }],
+                legend: "0 to 50".into(),
+                ..Section::default()
+            }],
             film: vec![gray(1), gray(2)],
             settings: "[train]\nsteps = 1\n".into(),
             ..Report::default()
@@ -266,7 +301,18 @@ mod tests {
     #[test]
     fn every_part_with_content_is_shown_and_no_other() {
         let html = page(&sample());
-        for part in ["Fly-through", "Test views", "Loss", "PSNR on the test views", "Gaussians", "Time", "Settings"] {
+        for part in [
+            "Fly-through",
+            "Test views",
+            "Latency &amp; work",
+            "<em class=\"tag\">load</em>",
+            "0 to 50",
+            "Loss",
+            "PSNR on the test views",
+            "Gaussians",
+            "Time",
+            "Settings",
+        ] {
             assert!(html.contains(part), "{part}");
         }
         assert!(html.contains("backward <b>5.00 ms</b> 62 %") && !html.contains("no times of their own"));

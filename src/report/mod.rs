@@ -53,6 +53,8 @@ pub struct Report {
     pub views: Vec<ViewPanel>,
     /// Every measured view: name, PSNR in dB, SSIM.
     pub scores: Vec<(String, f64, f64)>,
+    /// Sections of their own, after the views.
+    pub sections: Vec<Section>,
     /// Frames of a camera path through the model, to play.
     pub film: Vec<RgbImage8>,
     /// What is known about the scene and the model, name and value.
@@ -81,6 +83,30 @@ impl Figure {
     pub fn new(value: impl Into<String>, unit: &str, label: &str) -> Self {
         Self { value: value.into(), unit: unit.to_owned(), label: label.to_owned() }
     }
+}
+
+/// A section that one kind of run has: plots, and rows of pictures.
+#[derive(Debug, Clone, Default)]
+pub struct Section {
+    /// Heading.
+    pub heading: String,
+    /// A sentence or two.
+    pub text: String,
+    /// Plots with their captions, SVG.
+    pub plots: Vec<(String, String)>,
+    /// Rows of pictures.
+    pub rows: Vec<PictureRow>,
+    /// What the dark and the bright end of heat colours stand for; empty without such pictures.
+    pub legend: String,
+}
+
+/// Pictures beside each other.
+#[derive(Debug, Clone, Default)]
+pub struct PictureRow {
+    /// Caption.
+    pub caption: String,
+    /// Pictures with their tags.
+    pub pictures: Vec<(String, RgbImage8)>,
 }
 
 /// One logged training step.

@@ -1,18 +1,17 @@
 //! The tree of known settings, and what is wrong with a key or value that does not fit it.
 //!
-//! The tree is the serialised default [`Config`]: objects whose leaves are default values.
+//! The tree is that of a [`Schema`]: objects whose leaves are default values.
 
+use super::schema::Schema;
 use crate::diagnostics::nearest;
-use crate::terms::TermSection;
-use gazesplat_train::Config;
 use serde_json::Value as Json;
 use std::ops::Range;
 use toml::de::{DeTable, DeValue};
 
 /// Every key with its default, as `train.steps = 30000`: the list that `train --help` shows.
-pub fn describe_keys() -> String {
+pub fn describe_keys(schema: &Schema) -> String {
     let mut lines = Vec::new();
-    leaves(&known_keys(), "", &mut |path, default| {
+    leaves(&schema.known_keys(), "", &mut |path, default| {
         lines.push(if default.is_null() { format!("  {path}") } else { format!("  {path} = {}", show(default)) });
     });
     lines.join("\n")
@@ -61,26 +60,6 @@ impl Problem {
     }
 }
 
-/// The default settings as a tree of objects whose leaves are default values; `null` for "no default".
-pub(super) fn known_keys() -> Json {
-    let tree = "settings are plain tables of numbers and text";
-    let mut keys = serde_json::to_value(Config::default()).expect(tree);
-    graft(&mut keys, serde_json::to_value(TermSection::default()).expect(tree));
-    keys
-}
-
-/// Adds the branches of `more` to `tree`.
-fn graft(tree: &mut Json, more: Json) {
-    match (tree, more) {
-        (Json::Object(tree), Json::Object(more)) => {
-            for (key, child) in more {
-                graft(tree.entry(key).or_insert(Json::Null), child);
-            }
-        }
-        (tree, more) => *tree = more,
-    }
-}
-
 pub(super) fn find<'a>(keys: &'a Json, path: &str) -> Option<&'a Json> {
     path.split('.').try_fold(keys, |node, part| node.as_object()?.get(part))
 }
@@ -101,14 +80,14 @@ fn join(prefix: &str, key: &str) -> String {
 }
 
 /// Walks a document beside the tree of known keys.
-pub(super) fn check_table(table: &DeTable<'_>, keys: &Json, prefix: &str) -> Result<(), Problem> {
+pub(super) fn check_table(table: &DeTable<'_>, keys: &Json, schema: &Schema, prefix: &str) -> Result<(), Problem> {
     for (key, value) in table.iter() {
         let path = join(prefix, key.get_ref());
         let Some(default) = find(keys, &path) else {
-            return Err(unknown_key(&path, keys).at(key.span(), "no such key"));
+            return Err(unknown_key(&path, keys, schema).at(key.span(), "no such key"));
         };
         match (value.get_ref(), default) {
-            (DeValue::Table(child), Json::Object(_)) => check_table(child, keys, &path)?,
+            (DeValue::Table(child), Json::Object(_)) => check_table(child, keys, schema, &path)?,
             (found, default) => {
                 check_value(&path, found, default).map_err(|p| p.at(value.span(), "wrong kind of value"))?;
             }
@@ -176,7 +155,7 @@ fn key_list(table: &serde_json::Map<String, Json>) -> String {
     table.keys().map(String::as_str).collect::<Vec<_>>().join(", ")
 }
 
-pub(super) fn unknown_key(path: &str, keys: &Json) -> Problem {
+pub(super) fn unknown_key(path: &str, keys: &Json, schema: &Schema) -> Problem {
     let problem = Problem::new(format!("`{path}` is not a setting"));
     if let Some(Json::Object(table)) = find(keys, path) {
         return problem.hint(format!("it is a table; name one of its keys: {}", key_list(table)));
@@ -197,6 +176,6 @@ pub(super) fn unknown_key(path: &str, keys: &Json) -> Problem {
     });
     match near {
         Some(near) => problem.hint(format!("did you mean `{near}`?")),
-        None => problem.hint("`gazesplat train --help` lists every key"),
+        None => problem.hint(format!("`gazesplat {} --help` lists every key", schema.command)),
     }
 }

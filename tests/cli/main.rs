@@ -9,6 +9,7 @@ mod eval;
 mod help;
 mod hvsq;
 mod info;
+mod prune;
 mod render;
 mod settings;
 mod support;

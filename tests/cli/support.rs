@@ -3,6 +3,7 @@
 use assert_cmd::cargo::cargo_bin_cmd;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::process::Stdio;
 use std::sync::LazyLock;
 use tempfile::TempDir;
 
@@ -78,6 +79,21 @@ impl Place {
         command.env("VK_DRIVER_FILES", "/nonexistent").env("VK_ICD_FILENAMES", "/nonexistent");
         command.env_remove("VK_ADD_DRIVER_FILES");
         Self::end(command)
+    }
+
+    /// Starts `gazesplat` with `args` here and kills it as soon as `is_time`; returns when it has ended either way.
+    pub fn kill_when(&self, args: &[&str], is_time: impl Fn() -> bool) {
+        let mut command = std::process::Command::new(assert_cmd::cargo::cargo_bin!("gazesplat"));
+        command.args(args).current_dir(self.0.path()).stdout(Stdio::null()).stderr(Stdio::null());
+        let mut child = command.spawn().expect("the program starts");
+        while child.try_wait().expect("it can be waited for").is_none() {
+            if is_time() {
+                child.kill().expect("it can be killed");
+                child.wait().expect("it can be waited for");
+                return;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
     }
 
     fn end(mut command: assert_cmd::Command) -> Ended {

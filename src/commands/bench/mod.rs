@@ -1,5 +1,7 @@
 //! `gazesplat bench`: what a part of the program gains and costs, one file per study.
 
+pub mod ablation;
+pub mod prune_curve;
 pub mod termination;
 
 use crate::console::Console;
@@ -10,7 +12,9 @@ use clap::{Args, Subcommand};
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Examples:
-  gazesplat bench termination model.ply --scene fox --out study")]
+  gazesplat bench termination model.ply --scene fox --out study
+  gazesplat bench prune-curve model.ply --scene fox
+  gazesplat bench ablation runs/fox-1 --scene fox")]
 pub struct BenchArgs {
     /// What to measure
     #[command(subcommand)]
@@ -22,6 +26,10 @@ pub struct BenchArgs {
 pub enum Study {
     /// Error against time of every termination rule: fixed, naive, and the tables at several γ
     Termination(termination::StudyArgs),
+    /// Quality against time of every criterion of pruning, one shot per share that is kept
+    PruneCurve(prune_curve::CurveArgs),
+    /// What scale decay and removal each contribute to a pruning under a guard
+    Ablation(ablation::AblationArgs),
 }
 
 /// Runs `bench`.
@@ -31,5 +39,7 @@ pub enum Study {
 pub fn command(args: &BenchArgs, console: &Console) -> Result<()> {
     match &args.study {
         Study::Termination(args) => termination::command(args, console),
+        Study::PruneCurve(args) => prune_curve::command(args, console),
+        Study::Ablation(args) => ablation::command(args, console),
     }
 }

@@ -1,4 +1,5 @@
-//! The operations on a model, on the CPU and, where there is one, on a GPU.
+//! The operations on a model, on the CPU and, where there is one, on a GPU. The file is long because every operation is
+//! tested with the same few helpers.
 
 use super::*;
 use crate::config::OptimSection;
@@ -366,5 +367,79 @@ fn widened_rows_keep_their_first_values() {
             }
         }
         assert_eq!(state.num_coefficients(), 4);
+    }
+}
+
+#[test]
+fn selected_rows_keep_their_moments_and_their_order() {
+    let start = random(700, 4, 3);
+    let rows: Vec<u32> = (0..700).filter(|i| i % 3 != 1).rev().collect();
+    for device in devices() {
+        let mut state = model(&start, &device);
+        update(&mut state, &random(700, 4, 4), 0.5);
+        let (before, moments) = (params(&state), state.moments().expect("the device answers"));
+        let handed_out = state.splats();
+        state.select_rows(rows.clone()).expect("it fits");
+        let (after, new_moments) = (params(&state), state.moments().expect("the device answers"));
+        assert_eq!((state.num_rows(), state.num_updates()), (rows.len(), 1));
+        for (found, expected) in [(&after, &before), (&new_moments[0], &moments[0]), (&new_moments[1], &moments[1])] {
+            for (i, &row) in rows.iter().enumerate() {
+                for group in Group::ALL {
+                    assert_eq!(found.row(group, i), expected.row(group, row as usize));
+                }
+            }
+        }
+        assert_eq!(handed_out.len(), 700, "what was handed out stays");
+        update(&mut state, &random(rows.len(), 4, 5), 0.5);
+    }
+}
+
+#[test]
+fn clamped_opacities_forget_their_moments_and_only_theirs() {
+    let start = of_opacities(&[0.05, 0.9, 0.1, 0.999, 0.0999]);
+    for device in devices() {
+        let mut state = model(&start, &device);
+        update(&mut state, &random(5, 1, 8), 0.5);
+        let (before, moments) = (params(&state), state.moments().expect("the device answers"));
+        let handed_out = state.splats();
+        state.clamp_opacities(0.1).expect("it fits");
+        let limit = (0.1f32 / 0.9).ln();
+        let after = params(&state);
+        for (found, before) in after.of(Group::OpacityLogits).iter().zip(before.of(Group::OpacityLogits)) {
+            assert_eq!(*found, before.min(limit));
+        }
+        let new = state.moments().expect("the device answers");
+        for (new, old) in new.iter().zip(&moments) {
+            assert!(new.of(Group::OpacityLogits).iter().all(|v| *v == 0.0));
+            assert!(old.of(Group::OpacityLogits).iter().any(|v| *v != 0.0));
+            for group in [Group::Means, Group::Quats, Group::LogScales, Group::Sh] {
+                assert_eq!(new.of(group), old.of(group));
+            }
+        }
+        let kept = Columns::from_splats(handed_out).expect("the device answers");
+        assert_eq!(kept, before, "what was handed out stays");
+    }
+}
+
+#[test]
+fn snapshot_outlives_what_happens_to_the_state() {
+    for device in devices() {
+        let mut state = model(&random(300, 4, 1), &device);
+        update(&mut state, &random(300, 4, 2), 0.5);
+        let snapshot = state.snapshot().expect("it fits");
+        let expected = snapshot.to_host().expect("the device answers");
+        for _ in 0..2 {
+            update(&mut state, &random(300, 4, 3), 0.5);
+            state.select_rows((0..100).collect()).expect("it fits");
+            state.clamp_opacities(0.3).expect("it fits");
+            // A loss that is no number closes a state; going back opens it.
+            update(&mut state, &random(100, 4, 4), f32::NAN);
+            assert_eq!(snapshot.to_host().expect("the device answers"), expected);
+            state.restore(&snapshot).expect("it fits");
+            assert_eq!(state.snapshot().and_then(|s| s.to_host()).expect("the device answers"), expected);
+            assert_eq!((state.num_updates(), state.status().expect("the device answers").failed), (1, None));
+        }
+        let uploaded = Snapshot::from_host(expected.clone(), &device).expect("it fits");
+        assert_eq!(uploaded.to_host().expect("the device answers"), expected);
     }
 }

@@ -15,6 +15,7 @@ pub mod pruner;
 pub mod report;
 pub mod significance;
 pub mod simple;
+pub mod split;
 mod state;
 #[cfg(test)]
 mod tests;
@@ -24,3 +25,4 @@ pub use criterion::{Criterion, CriterionKind, RowValues};
 pub use guard::{Basis, Reference};
 pub use pruner::{Job, Progress, Pruner, one_shot};
 pub use report::{Check, Measured, Outcome, Part, Status};
+pub use split::{Split, split};

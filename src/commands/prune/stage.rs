@@ -1,0 +1,85 @@
+//! Scene, views and images of a pruning, before anything is pruned.
+
+use super::super::{Model, load_scene};
+use crate::console::Console;
+use crate::diagnostics::Result;
+use crate::progress;
+use crate::settings::Settings;
+use crate::terms::PruneTerms;
+use gazesplat_core::Dataset;
+use gazesplat_core::dataset::Holdout;
+use gazesplat_core::io::images::ImageCache;
+use gazesplat_render::device::Device;
+use gazesplat_train::Config;
+use gazesplat_train::metrics::Guard;
+use gazesplat_train::prune::{Job, PruneConfig, Pruner, Split, split};
+use std::path::Path;
+use std::sync::Arc;
+
+/// What a pruning works on.
+pub(crate) struct Stage {
+    /// Settings of the model's training, with what pruning shares of them: what a result is measured with.
+    pub train_config: Config,
+    pub dataset: Dataset,
+    pub split: Split,
+    pub images: Arc<ImageCache>,
+    pub guard_images: Arc<ImageCache>,
+    pub test_images: Arc<ImageCache>,
+}
+
+impl Stage {
+    /// Reads the scene and its images; `recorded` are the settings of the run that `model` comes from.
+    pub fn new(
+        model: &Model,
+        scene: &Path,
+        config: &PruneConfig,
+        recorded: &Settings,
+        console: &Console,
+    ) -> Result<Self> {
+        let mut train_config = recorded.resolve()?;
+        let holdout = model.run.is_some().then_some(train_config.data.holdout);
+        (train_config.data, train_config.render) = (config.data.clone(), config.render.clone());
+        // What training kept out is split here, by the same rule.
+        train_config.data.holdout = Holdout::None;
+        let dataset = load_scene(scene, &train_config, console)?;
+        let split = split(&dataset, config.guard.views, holdout)?;
+        if let Some(note) = &split.note {
+            console.warn(note);
+        }
+        let cache = |views: &[gazesplat_core::View]| Arc::new(ImageCache::new(views.to_vec(), config.data.cache_bytes));
+        let (images, guard_images) = (cache(&split.gradient), cache(&split.guard));
+        for images in [&images, &guard_images] {
+            let bar = progress::counting_bar(console, "reading images", images.len());
+            images.preload(|done, _| bar.set_position(done as u64))?;
+            bar.finish_and_clear();
+        }
+        let test_images = cache(&dataset.test);
+        Ok(Self { train_config, dataset, split, images, guard_images, test_images })
+    }
+
+    /// The pruning of `model`.
+    pub fn job<'a>(&'a self, model: &'a Model, config: &'a PruneConfig, device: &'a Device) -> Job<'a> {
+        Job {
+            cloud: &model.cloud,
+            dataset: &self.dataset,
+            images: Arc::clone(&self.images),
+            guard_images: Arc::clone(&self.guard_images),
+            counted: self.split.counted.iter().map(|view| (view.name.clone(), view.camera)).collect(),
+            config,
+            device,
+        }
+    }
+}
+
+/// `pruner` with the terms of the loss and the bounds that crate `train` knows nothing of.
+pub(crate) fn with_terms(pruner: Pruner, config: &PruneConfig, terms: &PruneTerms, stage: &Stage) -> Result<Pruner> {
+    let (loss, bound) = (config.guard.loss, terms.guard.hvsq.clone());
+    bound.add_to(Guard::default())?;
+    let mut pruner = pruner.with_guard(Box::new(move |reference, basis| {
+        bound.add_to(basis.guard(reference, loss)).expect("its settings have been checked")
+    }));
+    if let Some((loss, _)) = terms.loss.hvsq.make(&stage.split.gradient)? {
+        pruner.add_loss(terms.loss.hvsq.weight, loss);
+    }
+    Ok(pruner)
+}

@@ -150,7 +150,7 @@ impl<'a> Run<'a> {
     ) -> Result<Self> {
         log_machine();
         tracing::debug!("all settings:\n{}", settings::run_to_toml(&config, &terms));
-        let stage = Stage::new(model, &args.scene, &config, recorded, console)?;
+        let stage = Stage::new(model, &args.scene, &config, recorded, device.tensors(), console)?;
         let mut warnings = stage.dataset.warnings.clone();
         warnings.extend(stage.split.note.clone());
         let job = stage.job(model, &config, device.tensors());

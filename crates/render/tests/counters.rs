@@ -167,7 +167,8 @@ fn modes_fill_what_they_say() {
     assert_eq!(scene.frame().splat_stats, SplatStats::default());
     scene.options.stats = StatsMode::Tiles;
     let tiles = scene.frame().splat_stats;
-    assert_eq!(tiles, SplatStats { tiles_used: all.tiles_used.clone(), ..SplatStats::default() });
+    let expected = SplatStats { tiles_used: all.tiles_used.clone(), tiles: all.tiles.clone(), ..SplatStats::default() };
+    assert_eq!(tiles, expected);
     scene.options.stats = StatsMode::Dominance;
     let dominance = scene.frame().splat_stats;
     assert_eq!(dominance.tiles_used, all.tiles_used);
@@ -185,6 +186,39 @@ fn training_counts_what_inference_counts() {
     scene.options.stats = StatsMode::All;
     let (training, _) = scene.frame_and_gradients(&vec![1.0; scene.image_len()]);
     assert!(training.splat_stats == scene.frame().splat_stats);
+}
+
+/// Counting alone fills what a frame with its image fills, and counters leave the image as it is, bit for bit.
+#[test]
+fn counting_needs_no_image_and_leaves_it_alone() {
+    for (seed, mut scene) in scenes().step_by(9) {
+        scene.options.stats = StatsMode::None;
+        let plain = scene.frame();
+        for mode in [StatsMode::Tiles, StatsMode::Dominance, StatsMode::All] {
+            scene.options.stats = mode;
+            let frame = scene.frame();
+            assert!(frame.image == plain.image, "scene {seed}, {mode:?}");
+            let counted = scene.counted();
+            assert!(counted.splat_stats == frame.splat_stats, "scene {seed}, {mode:?}");
+            assert_eq!(counted.stats.num_pairs, frame.stats.num_pairs, "scene {seed}, {mode:?}");
+            assert_eq!(counted.stats.num_pairs_used, frame.stats.num_pairs_used, "scene {seed}, {mode:?}");
+            let tiles = &frame.splat_stats.tiles;
+            let sum = |counts: &[u32]| counts.iter().map(|&n| u64::from(n)).sum::<u64>();
+            assert_eq!(sum(&tiles.num_pairs), frame.stats.num_pairs, "scene {seed}");
+            assert_eq!(sum(&tiles.num_pairs_used), frame.stats.num_pairs_used, "scene {seed}");
+            assert_eq!(tiles.num_pairs.len() as u64, frame.stats.num_tiles);
+            assert!(tiles.num_pairs_used.iter().zip(&tiles.num_pairs).all(|(used, all)| used <= all));
+        }
+    }
+}
+
+#[test]
+fn counting_for_gradients_is_refused() {
+    let mut scene = random(4, Draw::default());
+    scene.options.pass = gazesplat_render::Pass::Train;
+    let splats = gazesplat_render::Splats::from_cloud(&scene.cloud, &crate::common::device()).expect("it fits");
+    let error = gazesplat_render::count(&splats, &scene.camera, &scene.options).expect_err("refused");
+    assert!(error.to_string().contains("pass"), "{error}");
 }
 
 #[test]
@@ -277,6 +311,8 @@ crate::common::on_gpu!(
     pairs_are_those_whose_alpha_reaches_the_cut_at_pixel_centres,
     modes_fill_what_they_say,
     training_counts_what_inference_counts,
+    counting_needs_no_image_and_leaves_it_alone,
+    counting_for_gradients_is_refused,
     permuting_gaussians_permutes_their_counters,
     a_wall_hides_what_stands_behind_it,
     a_tile_ends_where_its_last_pixel_stops,

@@ -11,7 +11,7 @@ use gazesplat_testkit::Rng;
 use gazesplat_testkit::devices::required_gpu;
 use gazesplat_train::evaluate::rgb;
 use gazesplat_train::prune::{
-    CriterionKind, GuardViews, Job, Part, Progress, PruneConfig, Pruner, Status, one_shot, split,
+    CriterionKind, GuardViews, Job, Part, Progress, Provenance, PruneConfig, Pruner, Status, one_shot, split,
 };
 use glam::Mat4;
 use std::sync::Arc;
@@ -161,7 +161,7 @@ fn pairs_per_tile(cloud: &GaussianCloud, dataset: &Dataset) -> f64 {
 #[test]
 fn idle_gaussians_go_and_the_guard_holds() {
     let (_dir, dataset, cloud) = scene_with_idle_gaussians();
-    let parts = split(&dataset, GuardViews::Holdout, Some(Holdout::Every8)).expect("views");
+    let parts = split(&dataset, GuardViews::Holdout, Provenance::Trained(Holdout::Every8)).expect("views");
     let run = |change: fn(&mut PruneConfig)| {
         let mut config = PruneConfig::default();
         config.prune.budget = 0.01;

@@ -82,7 +82,7 @@ fn study(args: &AblationArgs, device: &ComputeDevice, console: &Console) -> Resu
     let recorded = model.run_settings()?;
     let settings = recorded.carried_to(&PRUNE, &["data", "render"]).with_overrides(&args.overrides)?;
     let (config, terms) = settings.resolve_pruning()?;
-    let stage = Stage::new(&model, &args.scene, &config, &recorded, console)?;
+    let stage = Stage::new(&model, &args.scene, &config, &recorded, device.tensors(), console)?;
     let without_removal = {
         let mut config = config.clone();
         config.prune.rounds = 0;

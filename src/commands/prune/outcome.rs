@@ -153,9 +153,9 @@ impl Run<'_> {
         let mut sections = Vec::new();
         if let Some(svg) = curve {
             sections.push(Section {
-                heading: "Latency follows intersections".to_owned(),
-                text: "Models on the way from the dense one to the result, drawn in turn: what a frame costs goes with how \
-                       many Gaussians its tiles work through, not with how many there are."
+                heading: "Latency, points and intersections".to_owned(),
+                text: "Models on the way from the dense one to the result, drawn in turn: what a frame costs, how many \
+                       Gaussians there are, and how many of them a tile works through."
                     .to_owned(),
                 plots: vec![(format!("{} levels of pruning", result.levels.len()), svg)],
                 ..Section::default()

@@ -6,13 +6,14 @@ use crate::diagnostics::Result;
 use crate::progress;
 use crate::settings::Settings;
 use crate::terms::PruneTerms;
-use gazesplat_core::Dataset;
 use gazesplat_core::dataset::Holdout;
 use gazesplat_core::io::images::ImageCache;
+use gazesplat_core::{Dataset, View};
+use gazesplat_render::Splats;
 use gazesplat_render::device::Device;
 use gazesplat_train::Config;
 use gazesplat_train::metrics::Guard;
-use gazesplat_train::prune::{Job, PruneConfig, Pruner, Split, split};
+use gazesplat_train::prune::{Basis, Job, Provenance, PruneConfig, Pruner, Split, split};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -34,19 +35,31 @@ impl Stage {
         scene: &Path,
         config: &PruneConfig,
         recorded: &Settings,
+        device: &Device,
         console: &Console,
     ) -> Result<Self> {
         let mut train_config = recorded.resolve()?;
-        let holdout = model.run.is_some().then_some(train_config.data.holdout);
+        let trained = model.run.is_some().then_some(train_config.data.holdout);
         (train_config.data, train_config.render) = (config.data.clone(), config.render.clone());
         // What training kept out is split here, by the same rule.
         train_config.data.holdout = Holdout::None;
         let dataset = load_scene(scene, &train_config, console)?;
-        let split = split(&dataset, config.guard.views, holdout)?;
+        let cache = |views: &[View]| Arc::new(ImageCache::new(views.to_vec(), config.data.cache_bytes));
+        // Who would judge tells whether these are renders of the model, which its own settings do not say.
+        let judges = cache(&split(&dataset, config.guard.views, Provenance::OwnRenders)?.guard);
+        let quality = {
+            let splats = Splats::from_cloud(&model.cloud, device)?;
+            gazesplat_train::evaluate(&splats, &judges, &train_config.render_options(), &mut |_, _| {})?
+        };
+        let provenance = match (Basis::for_reference(quality.psnr), trained) {
+            (Basis::Floor, _) => Provenance::OwnRenders,
+            (Basis::Share, Some(holdout)) => Provenance::Trained(holdout),
+            (Basis::Share, None) => Provenance::Unknown,
+        };
+        let split = split(&dataset, config.guard.views, provenance)?;
         if let Some(note) = &split.note {
             console.warn(note);
         }
-        let cache = |views: &[gazesplat_core::View]| Arc::new(ImageCache::new(views.to_vec(), config.data.cache_bytes));
         let (images, guard_images) = (cache(&split.gradient), cache(&split.guard));
         for images in [&images, &guard_images] {
             let bar = progress::counting_bar(console, "reading images", images.len());

@@ -167,6 +167,12 @@ impl Scene {
         self.frame_on(&device())
     }
 
+    /// Counts on the [`device`] of this test, without an image.
+    pub fn counted(&self) -> gazesplat_render::Counted {
+        let splats = Splats::from_cloud(&self.cloud, &device()).expect("it fits");
+        gazesplat_render::count(&splats, &self.camera, &self.options).expect("the scene is legal")
+    }
+
     /// Renders without gradients.
     pub fn frame_on(&self, device: &Device) -> Frame {
         let splats = Splats::from_cloud(&self.cloud, device).expect("it fits");

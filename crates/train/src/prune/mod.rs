@@ -25,4 +25,4 @@ pub use criterion::{Criterion, CriterionKind, RowValues};
 pub use guard::{Basis, Reference};
 pub use pruner::{Job, Progress, Pruner, one_shot};
 pub use report::{Check, Measured, Outcome, Part, Status};
-pub use split::{Split, split};
+pub use split::{Provenance, Split, split};

@@ -25,13 +25,24 @@ const MIN_VIEWS_FOR_HOLDOUT: usize = 3;
 /// One view in this many judges; the one in the middle of each group.
 const GUARD_EVERY: usize = 8;
 
-/// Splits the training views of `dataset`, of which it must hold none out itself. `recorded` is what the training of the
-/// model kept out, `None` if that is not known: a model that was trained on the views that are to judge it has a quality on
-/// them that no retraining can hold, so these then stay in the gradient steps.
+/// What is known about the views that a model was made from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Provenance {
+    /// It was trained with this split.
+    Trained(Holdout),
+    /// The photographs are renders of the model itself: its quality on them says nothing about which it was trained on.
+    OwnRenders,
+    /// Nothing.
+    Unknown,
+}
+
+/// Splits the training views of `dataset`, of which it must hold none out itself. A model that was trained on the views that
+/// are to judge it has a quality on them that no retraining can hold, so these then stay in the gradient steps. Renders of
+/// the model itself are held to floors, which can be held on unseen views as well.
 ///
 /// # Errors
 /// [`Error::NoTrainingViews`]; [`Error::Prune`] when the test views are to judge and there are none.
-pub fn split(dataset: &Dataset, wanted: GuardViews, recorded: Option<Holdout>) -> Result<Split> {
+pub fn split(dataset: &Dataset, wanted: GuardViews, provenance: Provenance) -> Result<Split> {
     let counted = dataset.train.clone();
     if counted.is_empty() {
         return Err(Error::NoTrainingViews { num_test: dataset.test.len() });
@@ -56,10 +67,10 @@ pub fn split(dataset: &Dataset, wanted: GuardViews, recorded: Option<Holdout>) -
             if counted.len() < MIN_VIEWS_FOR_HOLDOUT {
                 return Some(format!("{} training views are too few to keep one out", counted.len()));
             }
-            match recorded {
-                Some(Holdout::Every8) => None,
-                Some(Holdout::None) => Some("the model was trained on all views".to_owned()),
-                None => Some("it is not known which views the model was trained on".to_owned()),
+            match provenance {
+                Provenance::Trained(Holdout::Every8) | Provenance::OwnRenders => None,
+                Provenance::Trained(Holdout::None) => Some("the model was trained on all views".to_owned()),
+                Provenance::Unknown => Some("it is not known which views the model was trained on".to_owned()),
             }
         })
         .flatten()
@@ -90,7 +101,7 @@ mod tests {
 
     #[test]
     fn every_eighth_training_view_judges_and_stays_out() {
-        let found = split(&dataset(21, 2), GuardViews::Holdout, Some(Holdout::Every8)).expect("views");
+        let found = split(&dataset(21, 2), GuardViews::Holdout, Provenance::Trained(Holdout::Every8)).expect("views");
         assert_eq!(names(&found.guard), ["04", "12", "20"]);
         assert_eq!((found.gradient.len(), found.counted.len(), found.views), (18, 21, GuardViews::Holdout));
         assert!(!names(&found.gradient).contains(&"12") && found.note.is_none());
@@ -98,31 +109,40 @@ mod tests {
 
     #[test]
     fn views_the_model_knows_stay_in_and_it_is_said() {
-        for (recorded, why) in [(None, "it is not known which"), (Some(Holdout::None), "trained on all views")] {
-            let found = split(&dataset(21, 2), GuardViews::Holdout, recorded).expect("views");
+        for (provenance, why) in [
+            (Provenance::Unknown, "it is not known which"),
+            (Provenance::Trained(Holdout::None), "trained on all views"),
+        ] {
+            let found = split(&dataset(21, 2), GuardViews::Holdout, provenance).expect("views");
             assert_eq!((found.gradient.len(), found.guard.len(), found.views), (21, 3, GuardViews::Train));
             assert!(found.note.expect("said").contains(why));
         }
-        let asked = split(&dataset(21, 2), GuardViews::Train, None).expect("views");
+        let asked = split(&dataset(21, 2), GuardViews::Train, Provenance::Unknown).expect("views");
         assert!(asked.note.is_none() && asked.views == GuardViews::Train);
+        let own = split(&dataset(21, 2), GuardViews::Holdout, Provenance::OwnRenders).expect("views");
+        assert!(own.note.is_none() && own.views == GuardViews::Holdout && own.gradient.len() == 18);
     }
 
     #[test]
     fn few_views_have_one_judge_and_very_few_keep_it() {
         for (n, judge) in [(7, "04"), (4, "03"), (3, "02")] {
-            let found = split(&dataset(n, 0), GuardViews::Holdout, Some(Holdout::Every8)).expect("views");
+            let found =
+                split(&dataset(n, 0), GuardViews::Holdout, Provenance::Trained(Holdout::Every8)).expect("views");
             assert_eq!((names(&found.guard), found.gradient.len()), (vec![judge], n - 1));
         }
-        let found = split(&dataset(2, 0), GuardViews::Holdout, Some(Holdout::Every8)).expect("views");
+        let found = split(&dataset(2, 0), GuardViews::Holdout, Provenance::Trained(Holdout::Every8)).expect("views");
         assert_eq!((found.gradient.len(), found.views), (2, GuardViews::Train));
         assert!(found.note.expect("said").contains("too few"));
-        assert!(matches!(split(&dataset(0, 2), GuardViews::Train, None), Err(Error::NoTrainingViews { num_test: 2 })));
+        assert!(matches!(
+            split(&dataset(0, 2), GuardViews::Train, Provenance::Unknown),
+            Err(Error::NoTrainingViews { num_test: 2 })
+        ));
     }
 
     #[test]
     fn test_views_judge_only_when_there_are_some() {
-        let found = split(&dataset(9, 2), GuardViews::Test, None).expect("views");
+        let found = split(&dataset(9, 2), GuardViews::Test, Provenance::Unknown).expect("views");
         assert_eq!((found.guard.len(), found.gradient.len(), found.counted.len()), (2, 9, 9));
-        assert!(split(&dataset(9, 0), GuardViews::Test, None).is_err());
+        assert!(split(&dataset(9, 0), GuardViews::Test, Provenance::Unknown).is_err());
     }
 }

@@ -43,6 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         guard_images: cache(&views.guard),
         counted: views.counted.iter().map(|view| (view.name.clone(), view.camera)).collect(),
         config: &config,
+        more_settings: &serde_json::Value::Null,
         device: &cpu_device(),
     })?;
     loop {

@@ -9,7 +9,7 @@ use super::device::ComputeDevice;
 use super::{Model, log_machine, scene_name};
 use crate::cli::DeviceArgs;
 use crate::console::{Console, grouped};
-use crate::diagnostics::Result;
+use crate::diagnostics::{Failure, Result};
 use crate::interrupt;
 use crate::progress::TrainProgress;
 use crate::settings::{self, PRUNE, Settings};
@@ -19,9 +19,9 @@ use files::PruneDir;
 use gazesplat_train::prune::{Basis, Check, Plan, Progress, PruneConfig, Pruner};
 use gazesplat_train::with_threads;
 use stage::{Stage, with_terms};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Arguments of `prune`.
 #[derive(Debug, Args)]
@@ -123,6 +123,11 @@ fn resolved(args: &PruneArgs, recorded: &Settings) -> Result<(PruneConfig, Prune
     settings.resolve_pruning()
 }
 
+/// Whether both paths lead to the same directory.
+fn is_same_place(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
 /// Everything of one run.
 struct Run<'a> {
     model: &'a Model,
@@ -136,6 +141,8 @@ struct Run<'a> {
     warnings: Vec<String>,
     scene: PathBuf,
     started: Instant,
+    /// Time that the run took before it was interrupted.
+    earlier: Duration,
 }
 
 impl<'a> Run<'a> {
@@ -153,15 +160,24 @@ impl<'a> Run<'a> {
         let stage = Stage::new(model, &args.scene, &config, recorded, device.tensors(), console)?;
         let mut warnings = stage.dataset.warnings.clone();
         warnings.extend(stage.split.note.clone());
-        let job = stage.job(model, &config, device.tensors());
+        let recorded_terms = serde_json::to_value(&terms).expect("settings are plain data");
+        let job = stage.job(model, &config, &recorded_terms, device.tensors());
+        let mut earlier = Duration::ZERO;
         let (pruner, dir) = if args.resume {
             let out = args.out.as_deref().unwrap_or(&args.model);
             let mut dir = PruneDir::open_interrupted(out)?;
-            let (pruner, report_bytes) = Pruner::resume(&job, &dir.checkpoint_path())?;
-            dir.continue_report(report_bytes)?;
+            let (pruner, noted) = Pruner::resume(&job, &dir.checkpoint_path())?;
+            dir.continue_report(noted.report_bytes)?;
+            earlier = Duration::from_secs_f64(noted.elapsed_s.clamp(0.0, 1e9));
             console.note(format_args!("resuming `{}` at step {}", out.display(), pruner.iteration()));
             (pruner, dir)
         } else {
+            if let (Some(out), Some(run), true) = (&args.out, &model.run, args.overwrite)
+                && is_same_place(out, run.path())
+            {
+                return Err(Failure::new(format!("`{}` is the dense model itself", out.display()))
+                    .hint("the run that is pruned is not replaced: choose another directory with `--out`"));
+            }
             let pruner = Pruner::new(&job)?;
             let name = format!("{}-pruned", scene_name(&args.scene));
             (pruner, PruneDir::create(args.out.as_deref(), &name, args.overwrite)?)
@@ -179,6 +195,7 @@ impl<'a> Run<'a> {
             warnings,
             scene: args.scene.clone(),
             started: Instant::now(),
+            earlier,
         };
         run.tell_plan();
         Ok(run)
@@ -188,7 +205,10 @@ impl<'a> Run<'a> {
     fn tell_plan(&self) {
         let Plan { reference, prune, adapt, event_every, .. } = *self.pruner.plan();
         let (events, rounds) = (self.pruner.plan().num_events(), self.config.prune.rounds as usize);
-        let frames = events as usize * (self.stage.split.guard.len() + rounds * self.stage.split.counted.len());
+        // Every event and every final round; the checks of the reference and of the adaptation.
+        let (guard, counted) = (self.stage.split.guard.len(), self.stage.split.counted.len());
+        let checks = 2 + events as usize + 1 + rounds + adapt.div_ceil(event_every) as usize;
+        let frames = checks * guard + (events as usize + 1) * rounds * counted;
         self.console.note(format_args!(
             "{} Gaussians; {} training views, {} of {} judge ({}), {} test views",
             grouped(self.model.cloud.len()),
@@ -216,7 +236,8 @@ impl<'a> Run<'a> {
         let mut bar = TrainProgress::new(self.console, reference + prune + adapt);
         loop {
             if stop.load(Ordering::Relaxed) {
-                self.dir.save(&mut self.pruner)?;
+                let elapsed_s = self.elapsed_s();
+                self.dir.save(&mut self.pruner, elapsed_s)?;
                 drop(bar);
                 self.console.note(format_args!(
                     "stopped after step {} of {}; go on with the same command and `--out {} --resume`",
@@ -240,6 +261,11 @@ impl<'a> Run<'a> {
         }
     }
 
+    /// Seconds that the run has taken, before an interruption too.
+    fn elapsed_s(&self) -> f64 {
+        (self.earlier + self.started.elapsed()).as_secs_f64()
+    }
+
     /// The first line of the report.
     fn header(&self) -> serde_json::Value {
         let names = |views: &[gazesplat_core::View]| views.iter().map(|v| v.name.clone()).collect::<Vec<_>>();
@@ -248,6 +274,7 @@ impl<'a> Run<'a> {
             "model": self.model.path.display().to_string(),
             "scene": self.scene.display().to_string(),
             "points": self.model.cloud.len(),
+            "model_hash": self.pruner.model_fingerprint(),
             "seed": self.config.prune.seed,
             "guard": self.stage.split.views.name(),
             "guard_views": names(&self.stage.split.guard),
@@ -261,12 +288,13 @@ impl<'a> Run<'a> {
 
     /// Records a check, keeps its level, and saves.
     fn check(&mut self, check: &Check) -> Result<()> {
-        self.dir.append(check, self.started.elapsed().as_secs_f64())?;
+        let elapsed_s = self.elapsed_s();
+        self.dir.append(check, elapsed_s)?;
         self.tell(check);
         if check.accepted && self.dir.wants_level(check.measured.points) {
             self.dir.write_level(&self.pruner.result()?)?;
         }
-        self.dir.save(&mut self.pruner)
+        self.dir.save(&mut self.pruner, elapsed_s)
     }
 
     fn tell(&self, check: &Check) {

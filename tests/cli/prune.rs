@@ -58,35 +58,76 @@ fn unknown_views_of_the_model_are_said() {
     assert!(said.contains("it is not known which views the model was trained on"), "{said}");
 }
 
+/// What does not depend on the clock of a report's lines.
+fn timeless(place: &Place, file: &str) -> Vec<Value> {
+    fn strip(value: &mut Value) {
+        if let Some(object) = value.as_object_mut() {
+            for key in ["render_ms", "elapsed_s", "ms", "speed_up", "correlation_points", "correlation_pairs_used"] {
+                object.remove(key);
+            }
+            object.values_mut().for_each(strip);
+        } else if let Some(list) = value.as_array_mut() {
+            list.iter_mut().for_each(strip);
+        }
+    }
+    let mut lines = lines(place, file);
+    lines.iter_mut().for_each(strip);
+    lines
+}
+
+/// Killed at three moments, one after the other, and gone on with: model and report are those of the uninterrupted run.
 #[test]
-fn interrupted_run_is_gone_on_with_and_not_replaced_unasked() {
+fn killed_run_is_gone_on_with_to_the_same_end() {
     let place = Place::with_run();
     prune(&place, &["--out", "whole"]).done();
     let checkpoint = place.path("killed/checkpoint.safetensors");
+    let report = place.path("killed/prune.jsonl");
+    let num_lines = || std::fs::read_to_string(&report).map_or(0, |text| text.lines().count());
     let args = [&["prune", "run", "--scene", "scene", "--out", "killed"], BRIEF.as_slice()].concat();
     place.kill_when(&args, || checkpoint.is_file());
-    assert!(checkpoint.is_file(), "the run was killed at its first checkpoint, long before its end");
+    assert!(checkpoint.is_file(), "killed at the first checkpoint, long before the end");
     let said = prune(&place, &["--out", "killed"]).refused();
     assert!(said.contains("holds an interrupted run") && said.contains("--resume"), "{said}");
     let said = prune(&place, &["--out", "killed", "--resume", "--set", "prune.share=0.5"]).refused();
     assert!(said.contains("prune.share = 0.02, now 0.5"), "{said}");
+    let said = prune(&place, &["--out", "killed", "--resume", "--set", "loss.hvsq.weight=2"]).refused();
+    assert!(said.contains("loss.hvsq.weight = 0.0, now 2.0"), "{said}");
+    let resumed = [args.as_slice(), &["--resume"]].concat();
+    for at_least in [4, 7] {
+        place.kill_when(&resumed, || num_lines() >= at_least);
+        assert!(checkpoint.is_file(), "killed at line {at_least} of the report, before the end");
+    }
+    let text = std::fs::read(&report).expect("readable");
+    std::fs::write(&report, &text[..10]).expect("writable");
+    let said = prune(&place, &["--out", "killed", "--resume"]).refused();
+    assert!(said.contains("has 10 bytes, the checkpoint knows of"), "{said}");
+    std::fs::write(&report, text).expect("writable");
     let said = prune(&place, &["--out", "killed", "--resume"]).done().stderr;
     assert!(said.contains("resuming `killed` at step "), "{said}");
-    assert_eq!(
-        std::fs::read(place.path("killed/point_cloud.ply")).expect("readable"),
-        std::fs::read(place.path("whole/point_cloud.ply")).expect("readable")
-    );
-    let timeless = |file: &str| {
-        let mut lines = lines(&place, file);
-        for line in &mut lines {
-            for key in ["render_ms", "elapsed_s"] {
-                line.as_object_mut().expect("object").remove(key);
-            }
-        }
-        lines.pop();
-        lines
-    };
-    assert_eq!(timeless("killed/prune.jsonl"), timeless("whole/prune.jsonl"));
+    let model = |run: &str| std::fs::read(place.path(&format!("{run}/point_cloud.ply"))).expect("readable");
+    assert!(model("killed") == model("whole"));
+    assert_eq!(timeless(&place, "killed/prune.jsonl"), timeless(&place, "whole/prune.jsonl"));
+    let said = prune(&place, &["--out", "killed", "--resume"]).refused();
+    assert!(said.contains("the run in it is finished"), "{said}");
+}
+
+#[test]
+fn studies_write_their_tables_and_plots() {
+    let place = Place::with_run();
+    let args = ["bench", "prune-curve", "run", "--scene", "scene", "--criteria", "ce,opacity", "--keep", "0.5,0.2"];
+    let more = ["--fine-tune", "5", "--repeats", "1", "--out", "curve"];
+    place.run(&[args.as_slice(), &more].concat()).done();
+    let files = ["latency.svg", "prune_curve.csv", "prune_curve.json", "quality_over_time.svg"];
+    assert_eq!(place.list("curve"), files);
+    assert_eq!(place.read("curve/prune_curve.csv").lines().count(), 6, "header, dense, two criteria of two shares");
+    let said = place.run(&[args.as_slice(), &["--keep", "1.5"]].concat()).refused();
+    assert!(said.contains("found 1.5"), "{said}");
+    let args =
+        ["bench", "ablation", "run", "--scene", "scene", "--set", "prune.budget=0.001", "--set", "guard.loss=0.2"];
+    place.run(&[args.as_slice(), &["--repeats", "1", "--out", "parts"]].concat()).done();
+    let csv = place.read("parts/ablation.csv");
+    let names: Vec<&str> = csv.lines().skip(1).filter_map(|line| line.split(',').next()).collect();
+    assert_eq!(names, ["dense", "SD only", "SD + CE"]);
 }
 
 #[test]
@@ -103,6 +144,9 @@ fn wrong_input_is_refused_with_a_reason() {
     assert!(!place.path("none").exists(), "nothing is left behind");
     let said = place.run(&["prune", "run", "--scene", "scene", "--quality", "x"]).stderr;
     assert!(said.contains("expected h, m, l, or a share"), "{said}");
-    place.write("run/empty.ply", "ply\n");
-    place.run(&["prune", "run/empty.ply", "--scene", "scene"]).refused();
+    let said = place.run(&["prune", "run", "--scene", "scene", "--out", "run", "--overwrite"]).refused();
+    assert!(said.contains("is the dense model itself"), "{said}");
+    assert!(place.path("run/point_cloud.ply").is_file());
+    let said = place.run(&["prune", "run"]);
+    assert!(said.code == 2 && said.stderr.contains("--scene"), "{}", said.stderr);
 }

@@ -86,9 +86,10 @@ fn permuting_rows_removes_the_same_gaussians() {
     let cloud = discs(&all);
     let order: Vec<usize> = (0..120).map(|i| (i * 77 + 5) % 120).collect();
     let permuted = cloud.select(&order);
-    for kind in CriterionKind::ALL {
+    let pairs = devices().into_iter().flat_map(|device| CriterionKind::ALL.map(|kind| (device.clone(), kind)));
+    for (device, kind) in pairs {
         let kept = |cloud: &GaussianCloud| {
-            let splats = Splats::from_cloud(cloud, &cpu_device()).expect("it fits");
+            let splats = Splats::from_cloud(cloud, &device).expect("it fits");
             let rows = one_shot(kind, &splats, &[camera()], &RenderOptions::default(), &[0.6]).expect("it draws");
             let mut depths: Vec<u32> = rows[0].iter().map(|&i| cloud.means[i as usize][2].to_bits()).collect();
             depths.sort_unstable();
@@ -175,6 +176,7 @@ fn idle_gaussians_go_and_the_guard_holds() {
             guard_images: images(&parts.guard),
             counted: parts.counted.iter().map(|v| (v.name.clone(), v.camera)).collect(),
             config: &config,
+            more_settings: &serde_json::Value::Null,
             device: &cpu_device(),
         };
         let mut pruner = Pruner::new(&job).expect("valid");

@@ -26,8 +26,8 @@ Examples:
   gazesplat bench ablation runs/fox-1 --scene fox --out study
   gazesplat bench ablation model.ply --scene fox --set prune.budget=0.1 --set guard.loss=0.02
 
-Runs the pruning loop twice, without removal and with it, under the same guard, and draws all
-models in turn. Writes ablation.csv, ablation.json and the models.")]
+Runs the pruning loop twice, without rounds of removal and with them, under the same guard, and
+draws all models in turn. What has faded goes in both. Writes ablation.csv, ablation.json and the models.")]
 pub struct AblationArgs {
     /// The dense model: a 3DGS PLY file, or the directory of a run
     pub model: PathBuf,
@@ -89,7 +89,8 @@ fn study(args: &AblationArgs, device: &ComputeDevice, console: &Console) -> Resu
         config
     };
     let run = |config: &PruneConfig| -> Result<(GaussianCloud, bool)> {
-        let pruner = Pruner::new(&stage.job(&model, config, device.tensors()))?;
+        let recorded_terms = serde_json::to_value(&terms).expect("settings are plain data");
+        let pruner = Pruner::new(&stage.job(&model, config, &recorded_terms, device.tensors()))?;
         let mut pruner = with_terms(pruner, config, &terms, &stage)?;
         let plan = *pruner.plan();
         let mut bar = TrainProgress::new(console, plan.reference + plan.num_steps());

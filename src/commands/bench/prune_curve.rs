@@ -158,7 +158,8 @@ fn cuts(
     options: &RenderOptions,
     console: &Console,
 ) -> Result<Vec<Cut>> {
-    let cameras: Vec<Camera> = dataset.train.iter().map(|view| view.camera).collect();
+    // What only a view sees that was kept out of training is worth no less.
+    let cameras: Vec<Camera> = dataset.train.iter().chain(&dataset.holdout).map(|view| view.camera).collect();
     let bar = progress::counting_bar(console, "ranking", args.criteria.len());
     let mut found = Vec::new();
     for &criterion in &args.criteria {

@@ -17,7 +17,7 @@ use crate::terms::PruneTerms;
 use gazesplat_core::GaussianCloud;
 use gazesplat_core::io::ply;
 use gazesplat_train::Config;
-use gazesplat_train::prune::{Check, PruneConfig, Pruner};
+use gazesplat_train::prune::{Check, Noted, PruneConfig, Pruner};
 use serde::Serialize;
 use std::fs::{self, File, OpenOptions};
 use std::io::Write as _;
@@ -158,8 +158,12 @@ impl PruneDir {
     }
 
     /// Writes the checkpoint.
-    pub fn save(&self, pruner: &mut Pruner) -> Result<()> {
-        Ok(pruner.save(&self.checkpoint_path(), self.report_bytes)?)
+    pub fn save(&self, pruner: &mut Pruner, elapsed_s: f64) -> Result<()> {
+        // The checkpoint says how long the report is: it must not reach the disk first.
+        if let Some(report) = &self.report {
+            report.sync_data().map_err(|e| cannot_write(&self.report_path(), e))?;
+        }
+        Ok(pruner.save(&self.checkpoint_path(), Noted { report_bytes: self.report_bytes, elapsed_s })?)
     }
 
     /// A failure of a step, with what is left to go on from.

@@ -13,7 +13,8 @@ use gazesplat_render::Splats;
 use gazesplat_render::device::Device;
 use gazesplat_train::Config;
 use gazesplat_train::metrics::Guard;
-use gazesplat_train::prune::{Basis, Job, Provenance, PruneConfig, Pruner, Split, split};
+use gazesplat_train::prune::{Basis, GuardViews, Job, Provenance, PruneConfig, Pruner, Split, split};
+use serde_json::Value as Json;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -39,7 +40,10 @@ impl Stage {
         console: &Console,
     ) -> Result<Self> {
         let mut train_config = recorded.resolve()?;
-        let trained = model.run.is_some().then_some(train_config.data.holdout);
+        // With another split it is not known which of these views the model was trained on.
+        let is_same_split =
+            train_config.data.test_every == config.data.test_every && train_config.data.images == config.data.images;
+        let trained = (model.run.is_some() && is_same_split).then_some(train_config.data.holdout);
         (train_config.data, train_config.render) = (config.data.clone(), config.render.clone());
         // What training kept out is split here, by the same rule.
         train_config.data.holdout = Holdout::None;
@@ -60,6 +64,9 @@ impl Stage {
         if let Some(note) = &split.note {
             console.warn(note);
         }
+        if split.views == GuardViews::Holdout {
+            train_config.data.holdout = Holdout::Every8;
+        }
         let (images, guard_images) = (cache(&split.gradient), cache(&split.guard));
         for images in [&images, &guard_images] {
             let bar = progress::counting_bar(console, "reading images", images.len());
@@ -71,7 +78,13 @@ impl Stage {
     }
 
     /// The pruning of `model`.
-    pub fn job<'a>(&'a self, model: &'a Model, config: &'a PruneConfig, device: &'a Device) -> Job<'a> {
+    pub fn job<'a>(
+        &'a self,
+        model: &'a Model,
+        config: &'a PruneConfig,
+        terms: &'a Json,
+        device: &'a Device,
+    ) -> Job<'a> {
         Job {
             cloud: &model.cloud,
             dataset: &self.dataset,
@@ -79,6 +92,7 @@ impl Stage {
             guard_images: Arc::clone(&self.guard_images),
             counted: self.split.counted.iter().map(|view| (view.name.clone(), view.camera)).collect(),
             config,
+            more_settings: terms,
             device,
         }
     }

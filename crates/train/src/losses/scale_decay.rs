@@ -13,7 +13,8 @@ use burn::tensor::{DType, Int, Tensor, TensorData};
 /// WS in units of `scale_unit` world units: `log_scales` `[N, 3]`, `used` the tiles each Gaussian is used in, `[N]`. 0 for
 /// an empty model.
 pub fn scale_decay(log_scales: &[f32], used: &[u32], scale_unit: f32) -> f64 {
-    let rows = log_scales.as_chunks::<3>().0.iter().zip(used);
+    // A row in no tile may have any scale, even one whose exponential is no number.
+    let rows = log_scales.as_chunks::<3>().0.iter().zip(used).filter(|(_, used)| excess_tiles(**used) > 0.0);
     let sum: f64 =
         rows.map(|(row, &used)| f64::from(row[largest_axis(row)]).exp() * f64::from(excess_tiles(used))).sum();
     sum / f64::from(scale_unit) / used.len().max(1) as f64
@@ -57,6 +58,7 @@ mod tests {
         assert!((scale_decay(&log_scales, &used, 1.0) - 1.5).abs() < 1e-6);
         assert!((scale_decay(&log_scales, &used, 3.0) - 0.5).abs() < 1e-6);
         assert_eq!(scale_decay(&[], &[], 1.0), 0.0);
+        assert_eq!(scale_decay(&[800.0, 0.0, 0.0, f32::NAN, 0.0, 0.0], &[0, 4], 1.0), 0.0);
         let mut devices = vec![cpu_device()];
         devices.extend(required_gpu(gpu_device(None)));
         for device in devices {

@@ -14,6 +14,15 @@ pub enum Bound {
     AtMost(f64),
 }
 
+impl std::fmt::Display for Bound {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::AtLeast(bound) => write!(f, "of at least {bound:.4}"),
+            Self::AtMost(bound) => write!(f, "of at most {bound:.3e}"),
+        }
+    }
+}
+
 impl Bound {
     /// Whether `value` holds it; NaN holds none.
     pub fn holds(self, value: f64) -> bool {

@@ -42,8 +42,8 @@ pub struct PruneSection {
     pub iterations: u32,
     /// Steps of adaptation after the last removal, before scaling. Default 5000.
     pub adapt_iterations: u32,
-    /// Steps from one event to the next, before scaling; scaled no lower than 100 and then to at most a sixth of the steps
-    /// with pruning. Default 1000.
+    /// Steps from one event to the next, before scaling; scaling leaves at least 100, if there were as many, and at most a
+    /// sixth of the steps with pruning. Default 1000.
     pub event_every: u32,
     /// Rounds of removal in an event. Default 5.
     pub rounds: u32,
@@ -292,10 +292,9 @@ impl PruneConfig {
         let min_opacity = p.min_opacity;
         check((0.0..1.0).contains(&min_opacity), "prune.min_opacity", &min_opacity, "a number in [0, 1)")?;
         check(p.min_points >= 1, "prune.min_points", &p.min_points, "at least 1")?;
-        if let Some(clamp) = p.opacity_clamp {
-            let expected = format!("a number above prune.min_opacity = {min_opacity} and at most 1");
-            check(clamp > min_opacity && clamp <= 1.0, "prune.opacity_clamp", &clamp, &expected)?;
-        }
+        let (clamp, expected) =
+            (self.plan().opacity_clamp, format!("above prune.min_opacity = {min_opacity}, at most 1"));
+        check(clamp > min_opacity && clamp <= 1.0, "prune.opacity_clamp", &clamp, &expected)?;
         check((0.0..1.0).contains(&self.guard.loss), "guard.loss", &self.guard.loss, "a number in [0, 1)")?;
         let decay = &self.scale_decay;
         let is_weight = |v: f64| v >= 0.0 && v.is_finite();
@@ -339,11 +338,12 @@ mod tests {
     fn values_out_of_range_are_named() {
         PruneConfig::default().validate().expect("the defaults are valid");
         type Change = fn(&mut PruneConfig);
-        let wrong: [(&str, Change); 9] = [
+        let wrong: [(&str, Change); 10] = [
             ("prune.budget", |c| c.prune.budget = f64::NAN),
             ("prune.event_every", |c| c.prune.event_every = 0),
             ("prune.share", |c| c.prune.share = 1.0),
             ("prune.opacity_clamp", |c| c.prune.opacity_clamp = Some(0.005)),
+            ("prune.opacity_clamp", |c| (c.prune.budget, c.prune.min_opacity) = (1.0, 0.2)),
             ("prune.min_points", |c| c.prune.min_points = 0),
             ("guard.loss", |c| c.guard.loss = 1.0),
             ("scale_decay.start", |c| c.scale_decay.start = -1.0),

@@ -44,13 +44,13 @@ impl Basis {
     }
 
     /// The least PSNR and SSIM when the share `loss` may be lost. Floors between the three of the specification are on
-    /// the lines through them.
+    /// the line through them; no share leads beyond the first and the last.
     pub fn bounds(self, reference: Reference, loss: f64) -> Reference {
         match self {
             Self::Share => Reference { psnr: reference.psnr * (1.0 - loss), ssim: reference.ssim * (1.0 - loss) },
             Self::Floor => {
                 let [(r, psnr, ssim), ..] = FLOORS;
-                let levels = (loss - r) / r;
+                let levels = ((loss - r) / r).clamp(0.0, (FLOORS.len() - 1) as f64);
                 Reference { psnr: psnr - 2.0 * levels, ssim: ssim - 0.01 * levels }
             }
         }
@@ -136,5 +136,7 @@ mod tests {
             let least = Basis::Floor.bounds(reference, loss);
             assert!((least.psnr - psnr).abs() < 1e-9 && (least.ssim - ssim).abs() < 1e-9, "{least:?}");
         }
+        assert_eq!(Basis::Floor.bounds(reference, 0.2), Basis::Floor.bounds(reference, 0.03));
+        assert_eq!(Basis::Floor.bounds(reference, 0.0), Basis::Floor.bounds(reference, 0.01));
     }
 }

@@ -23,6 +23,7 @@ mod tests;
 pub use config::{GuardViews, Plan, PruneConfig, ScaleUnit};
 pub use criterion::{Criterion, CriterionKind, RowValues};
 pub use guard::{Basis, Reference};
+pub use phase::Noted;
 pub use pruner::{Job, Progress, Pruner, one_shot};
 pub use report::{Check, Measured, Outcome, Part, Status};
 pub use split::{Provenance, Split, split};

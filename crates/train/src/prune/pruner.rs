@@ -7,7 +7,7 @@ use super::config::{Plan, PruneConfig, ScaleUnit};
 use super::criterion::CriterionKind;
 use super::decay::DecayControl;
 use super::guard::{Basis, Reference, check_reference, measure};
-use super::phase::{Origin, Passed, Phase, Record};
+use super::phase::{Noted, Origin, Passed, Phase, Record};
 use super::report::{Check, Measured, Outcome, Part, Status};
 use super::state::{kept, num_removed, rank, remove_faded};
 use crate::checkpoint;
@@ -38,6 +38,8 @@ pub struct Job<'a> {
     pub counted: Vec<(String, Camera)>,
     /// Settings.
     pub config: &'a PruneConfig,
+    /// Settings of what the caller adds to loss and guard: a run is resumed with the same only. `Null` = none.
+    pub more_settings: &'a serde_json::Value,
     /// Where to compute.
     pub device: &'a Device,
 }
@@ -59,6 +61,7 @@ pub type GuardFactory = Box<dyn Fn(Reference, Basis) -> Guard + Send>;
 /// A model that is being pruned.
 pub struct Pruner {
     config: PruneConfig,
+    more_settings: serde_json::Value,
     plan: Plan,
     trainer: Trainer,
     guard_images: Arc<ImageCache>,
@@ -116,10 +119,14 @@ impl Pruner {
                 job.counted.iter().map(|(name, _)| name.clone()).collect(),
                 names(&job.guard_images),
             ],
+            cameras: fingerprint_of_cameras(
+                job.counted.iter().map(|(_, camera)| camera).chain(job.guard_images.views().iter().map(|v| &v.camera)),
+            ),
         };
         let loss = job.config.guard.loss;
         let mut pruner = Self {
             config: job.config.clone(),
+            more_settings: job.more_settings.clone(),
             plan,
             trainer,
             guard_images: Arc::clone(&job.guard_images),
@@ -137,61 +144,72 @@ impl Pruner {
         Ok(pruner)
     }
 
-    /// Takes up the run that left the checkpoint at `path`. Also returns the length that its report had.
+    /// Takes up the run that left the checkpoint at `path`. Also returns what its caller had noted.
     ///
     /// # Errors
     /// As [`Pruner::new`]; [`Error::Checkpoint`] when the file is damaged, or of another model, scene or settings, each
     /// difference named.
-    pub fn resume(job: &Job<'_>, path: &Path) -> Result<(Self, u64)> {
+    pub fn resume(job: &Job<'_>, path: &Path) -> Result<(Self, Noted)> {
         let mut pruner = Self::new(job)?;
         let mut loaded: checkpoint::Loaded<Record> = checkpoint::load(path, KIND, &["state", "best"])?;
         let record = loaded.meta.clone();
         let refuse = |message: String| Error::Checkpoint { path: path.to_owned(), message };
         if record.origin != pruner.origin {
-            let what = if record.origin.model == pruner.origin.model { "on other views" } else { "of another model" };
+            let same_views = record.origin.views == pruner.origin.views;
+            let what = match record.origin.model == pruner.origin.model {
+                false => "of another model",
+                true if same_views => "with other cameras",
+                true => "on other views",
+            };
             return Err(refuse(format!("it is of a run {what}")));
         }
-        let differences = differences(&record.config, job.config);
+        let mut differences = differences(&record.config, job.config);
+        differences.extend(self::differences(&record.more_settings, job.more_settings));
         if !differences.is_empty() {
             return Err(refuse(format!("its settings differ: {}", differences.join(", "))));
         }
         let incomplete = || refuse("damaged: a model is missing".to_owned());
         let state: HostState = loaded.take("state").ok_or_else(incomplete)?;
+        let is_begun = !matches!(record.phase, Phase::Reference);
+        if is_begun && (record.reference.is_none() || record.best.is_none()) {
+            return Err(refuse("damaged: the reference is missing".to_owned()));
+        }
         let state = Snapshot::from_host(state, job.device)?;
-        if !matches!(record.phase, Phase::Reference) && pruner.plan.reference > 0 {
+        if is_begun && pruner.plan.reference > 0 {
             pruner.trainer = trainer(job, job.cloud, pruner.plan.num_steps(), false)?;
         }
         pruner.trainer.resume_at(record.step, &state)?;
         pruner.best = match record.best {
             Some(passed) => {
                 let best = loaded.take("best").ok_or_else(incomplete)?;
-                Some((Snapshot::from_host(best, job.device)?, passed))
+                Some((Snapshot::from_host(best, job.device)?, passed.exact()))
             }
             None => None,
         };
         pruner.phase = record.phase;
         pruner.decay.exponent = record.decay_exponent;
         if let Some((measured, basis)) = record.reference {
-            pruner.hold(measured, basis);
+            pruner.hold(measured.exact(), basis);
         }
-        Ok((pruner, record.report_bytes))
+        Ok((pruner, record.noted))
     }
 
-    /// Writes everything the run needs to go on; `report_bytes` is the length of the report so far.
+    /// Writes everything the run needs to go on, and what the caller wants to find again.
     ///
     /// # Errors
     /// When the device does not answer or the file cannot be written; one that was there before is then still there.
-    pub fn save(&mut self, path: &Path, report_bytes: u64) -> Result<()> {
+    pub fn save(&mut self, path: &Path, noted: Noted) -> Result<()> {
         self.trainer.settle()?;
         let record = Record {
             config: self.config.clone(),
+            more_settings: self.more_settings.clone(),
             origin: self.origin.clone(),
             phase: self.phase,
             step: self.trainer.step_index(),
             decay_exponent: self.decay.exponent,
-            reference: self.reference,
-            best: self.best.as_ref().map(|(_, passed)| *passed),
-            report_bytes,
+            reference: self.reference.map(|(measured, basis)| (measured.into(), basis)),
+            best: self.best.as_ref().map(|(_, passed)| (*passed).into()),
+            noted,
         };
         let state = self.trainer.state().snapshot()?.to_host()?;
         let best = self.best.as_ref().map(|(snapshot, _)| snapshot.to_host()).transpose()?;
@@ -212,6 +230,11 @@ impl Pruner {
     /// Adds `weight` times `loss` to what every step minimises.
     pub fn add_loss(&mut self, weight: f32, loss: Box<dyn crate::losses::ImageLoss>) {
         self.trainer.add_loss(weight, loss);
+    }
+
+    /// Fingerprint of the dense model.
+    pub fn model_fingerprint(&self) -> &str {
+        &self.origin.model
     }
 
     /// The schedule.
@@ -329,11 +352,12 @@ impl Pruner {
         // Shares hold for the reference by definition; floors and further metrics need not.
         let measured = self.measure()?;
         if !measured.passed {
-            let least = basis.bounds(reference, self.config.guard.loss);
+            let bounds: Vec<String> = self.guard.bounds().map(|(name, bound)| format!("{name} {bound}")).collect();
             return Err(Error::Prune(format!(
-                "the model misses the guard before anything is removed: {:.2} dB and an SSIM of {:.4}, at least {:.2} dB and \
-                 {:.4} are asked for",
-                reference.psnr, reference.ssim, least.psnr, least.ssim
+                "the model misses the guard before anything is removed: it has {:.2} dB and an SSIM of {:.4}, asked for are {}",
+                reference.psnr,
+                reference.ssim,
+                bounds.join(", ")
             )));
         }
         self.best = Some((self.trainer.state().snapshot()?, Passed { measured, is_real: false }));
@@ -359,7 +383,9 @@ impl Pruner {
         let measured = self.measure()?;
         let (reference, _) = self.reference.expect("nothing is checked before the reference");
         let reference = Reference { psnr: reference.psnr, ssim: reference.ssim };
-        Ok(Check::new(part, self.iteration(), measured, reference, self.decay.gamma()))
+        // Scales decay while Gaussians are removed, and not afterwards.
+        let gamma = if part == Part::Prune { self.decay.gamma() } else { 0.0 };
+        Ok(Check::new(part, self.iteration(), measured, reference, gamma))
     }
 
     /// One event: if the guard passes, keep the state and remove; else train on with a smaller γ.
@@ -399,7 +425,7 @@ impl Pruner {
         }
         self.phase = Phase::Final { round: 1 };
         if self.config.prune.rounds == 0 {
-            self.end_final()?;
+            check.faded = self.end_final()?;
         }
         Ok(Progress::Check(check))
     }
@@ -418,20 +444,21 @@ impl Pruner {
             check.rolled_back = true;
         }
         if !check.accepted || round >= self.config.prune.rounds || removed == 0 {
-            self.end_final()?;
+            check.faded = self.end_final()?;
         }
         Ok(Progress::Check(check))
     }
 
-    /// In every case: what has faded goes, opacities are clamped if asked for, and adaptation begins.
-    fn end_final(&mut self) -> Result<()> {
+    /// In every case: what has faded goes, opacities are clamped if asked for, and adaptation begins. Returns the number of
+    /// Gaussians gone.
+    fn end_final(&mut self) -> Result<usize> {
         let section = self.config.prune.clone();
-        remove_faded(self.trainer.state(), section.min_opacity, section.min_points)?;
+        let faded = remove_faded(self.trainer.state(), section.min_opacity, section.min_points)?;
         if section.final_clamp {
             self.clamp()?;
         }
         self.phase = Phase::Adapt { due: false };
-        Ok(())
+        Ok(faded)
     }
 
     /// A check of the adaptation: of the states that pass, the one with the fewest Gaussians, then the highest PSNR, stays.
@@ -537,22 +564,31 @@ pub fn one_shot(
 
 /// FNV-1a over the bits of all parameters: tells models apart, not attackers.
 fn fingerprint(cloud: &GaussianCloud) -> String {
-    let mut hash = 0xcbf2_9ce4_8422_2325u64;
-    let mut add = |values: &[f32]| {
-        for value in values {
-            hash = (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0000_0100_0000_01b3);
-        }
+    hashed(
+        [cloud.means.as_flattened(), cloud.quats.as_flattened(), cloud.log_scales.as_flattened()]
+            .into_iter()
+            .chain([cloud.opacity_logits.as_slice(), cloud.sh.as_flattened()])
+            .flatten()
+            .copied(),
+    )
+}
+
+fn fingerprint_of_cameras<'a>(cameras: impl Iterator<Item = &'a Camera>) -> String {
+    let values = |camera: &Camera| {
+        let p = camera.intrinsics;
+        let lens = [p.width as f32, p.height as f32, p.fx, p.fy, p.cx, p.cy];
+        lens.into_iter().chain(camera.camera_from_world.to_cols_array())
     };
-    add(cloud.means.as_flattened());
-    add(cloud.quats.as_flattened());
-    add(cloud.log_scales.as_flattened());
-    add(&cloud.opacity_logits);
-    add(cloud.sh.as_flattened());
-    format!("{hash:016x}")
+    hashed(cameras.flat_map(values))
+}
+
+fn hashed(values: impl Iterator<Item = f32>) -> String {
+    let step = |hash: u64, value: f32| (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0000_0100_0000_01b3);
+    format!("{:016x}", values.fold(0xcbf2_9ce4_8422_2325, step))
 }
 
 /// Settings that differ, as `key = old, now new`.
-fn differences(old: &PruneConfig, new: &PruneConfig) -> Vec<String> {
+fn differences(old: &impl serde::Serialize, new: &impl serde::Serialize) -> Vec<String> {
     fn compare(path: &str, old: &serde_json::Value, new: &serde_json::Value, out: &mut Vec<String>) {
         match (old.as_object(), new.as_object()) {
             (Some(a), Some(b)) => {
@@ -566,8 +602,12 @@ fn differences(old: &PruneConfig, new: &PruneConfig) -> Vec<String> {
             _ => out.push(format!("{path} = {old}, now {new}")),
         }
     }
-    let tree = |config: &PruneConfig| serde_json::to_value(config).expect("settings are plain data");
-    let mut out = Vec::new();
-    compare("", &tree(old), &tree(new), &mut out);
+    // Through the same text as the recorded ones went: reading a number back may cost its last digit.
+    fn tree(config: &impl serde::Serialize) -> serde_json::Value {
+        let text = serde_json::to_string(config).expect("settings are plain data");
+        serde_json::from_str(&text).expect("our own text")
+    }
+    let (mut out, old) = (Vec::new(), tree(&tree(old)));
+    compare("", &old, &tree(&tree(new)), &mut out);
     out
 }

@@ -48,7 +48,7 @@ pub struct Check {
     /// The model that was judged.
     #[serde(flatten)]
     pub measured: Measured,
-    /// Gaussians removed because of their opacity, before the check.
+    /// Gaussians removed because of their opacity, before the check; after the last of the final phase.
     pub faded: usize,
     /// Gaussians removed after the check, or in the round that was checked.
     pub removed: usize,
@@ -58,7 +58,7 @@ pub struct Check {
     pub psnr_ref: f64,
     /// The reference.
     pub ssim_ref: f64,
-    /// γ of scale decay after the check.
+    /// γ of scale decay in the steps that follow.
     pub gamma: f32,
     /// Whether the guard passed.
     pub accepted: bool,

@@ -72,7 +72,9 @@ pub(super) fn remove_faded(state: &mut ModelState, min_opacity: f32, min_points:
     let mut faded: Vec<u32> = (0..logits.len() as u32).filter(|&i| is_faded(logits[i as usize])).collect();
     let allowed = logits.len().saturating_sub(min_points);
     if faded.len() > allowed {
-        faded.sort_by(|&a, &b| logits[a as usize].total_cmp(&logits[b as usize]));
+        // What is no number goes before all numbers: nothing can be drawn of it.
+        let place = |i: u32| if logits[i as usize].is_nan() { f32::NEG_INFINITY } else { logits[i as usize] };
+        faded.sort_by(|&a, &b| place(a).total_cmp(&place(b)));
         faded.truncate(allowed);
     }
     if !faded.is_empty() {
@@ -84,6 +86,8 @@ pub(super) fn remove_faded(state: &mut ModelState, min_opacity: f32, min_points:
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::optim::{AdamSettings, Columns};
+    use gazesplat_render::cpu_device;
 
     #[test]
     fn round_removes_its_share_but_keeps_the_least() {
@@ -93,6 +97,26 @@ mod tests {
         assert_eq!(num_removed(100, 0.5, 80), 20);
         assert_eq!(num_removed(100, 0.0, 1), 0);
         assert_eq!(num_removed(5, 0.9, 10), 0);
+    }
+
+    #[test]
+    fn what_has_faded_goes_and_the_most_opaque_stays() {
+        let faded = |opacities: &[f32], min_opacity, min_points| {
+            let n = opacities.len();
+            let logits: Vec<f32> = opacities.iter().map(|o| (o / (1.0 - o)).ln()).collect();
+            let data = [vec![0.0; 3 * n], vec![1.0; 4 * n], vec![0.0; 3 * n], logits, vec![0.0; 3 * n]];
+            let params = Columns { data, widths: [3, 4, 3, 1, 3] };
+            let mut state = ModelState::new(params, AdamSettings::default(), &cpu_device()).expect("it fits");
+            let removed = remove_faded(&mut state, min_opacity, min_points).expect("a CPU answers");
+            let logits = host::read(state.lent().opacity_logits).expect("a CPU answers");
+            (removed, logits.iter().map(|l| 1.0 / (1.0 + (-l).exp())).collect::<Vec<f32>>())
+        };
+        let (removed, left) = faded(&[0.5, 0.001, f32::NAN, 0.2], 0.005, 1);
+        assert_eq!((removed, left.len()), (2, 2));
+        let (removed, left) = faded(&[0.001, f32::NAN, 0.004, 0.002], 0.005, 2);
+        assert_eq!(removed, 2);
+        assert!((left[0] - 0.004).abs() < 1e-5 && (left[1] - 0.002).abs() < 1e-5, "{left:?}");
+        assert_eq!(faded(&[0.001, 0.002], 0.0, 1).0, 0);
     }
 
     #[test]

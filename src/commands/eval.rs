@@ -28,7 +28,7 @@ file with the defaults.
 Gaussians with a value that is not finite are left out, with a warning that names the file and
 their number; a model without any other is refused.")]
 pub struct EvalArgs {
-    /// A 3DGS PLY file, or the directory of a run
+    /// A model file (PLY, compressed PLY, `.splat`, SPZ), or the directory of a run
     pub model: PathBuf,
     /// The scene with the photographs
     #[arg(long, value_name = "SCENE")]

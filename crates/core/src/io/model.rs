@@ -50,6 +50,16 @@ impl ModelFormat {
         }
     }
 
+    /// What a person calls it.
+    pub fn kind(self) -> &'static str {
+        match self {
+            Self::Ply => "3DGS PLY",
+            Self::CompressedPly => "compressed PLY",
+            Self::Splat => ".splat",
+            Self::Spz3 | Self::Spz4 => "SPZ",
+        }
+    }
+
     /// The format that the name of a file to be written asks for: `.compressed.ply`, `.ply`, `.splat`, `.spz` (version 3,
     /// which every reader takes).
     pub fn of_path(path: &Path) -> Option<Self> {

@@ -352,7 +352,7 @@ fn gzip(bytes: &[u8]) -> Vec<u8> {
     encoder.finish().unwrap()
 }
 
-/// One Gaussian of degree 1 by hand: position (1, −2, 0.5) · 2⁻⁸ steps in RUB, opacity 128/255, colours 255 127 0, log
+/// One Gaussian of degree 1 by hand: position (1, −2, 0.5), opacity 128/255, colours 255 127 0, log
 /// scales −10, 0, 5.9375, and coefficients 127/128, 0, −1 of the first.
 fn spz_by_hand(version: u32, rotation: &[u8]) -> Vec<u8> {
     let mut bytes = b"NGSP".to_vec();
@@ -371,14 +371,12 @@ fn spz_by_hand(version: u32, rotation: &[u8]) -> Vec<u8> {
 }
 
 fn assert_is_the_one_by_hand(cloud: &GaussianCloud, what: &str) {
-    // RUB to RDF: y and z the other way.
-    assert_eq!(cloud.means, [[1.0, 2.0, -0.5]], "{what}");
+    assert_eq!(cloud.means, [[1.0, -2.0, 0.5]], "{what}");
     assert_eq!(cloud.log_scales, [[-10.0, 0.0, 5.9375]], "{what}");
     assert!((opacity(cloud.opacity_logits[0]) - 128.0 / 255.0).abs() < 1e-6, "{what}");
     let dc = cloud.sh[0];
     assert!((dc[0] - 0.5 / 0.15).abs() < 1e-5 && (dc[2] + 0.5 / 0.15).abs() < 1e-5, "{what}: {dc:?}");
-    // Y₁₋₁ goes with y, Y₁₀ with z, Y₁₁ with x.
-    assert_eq!(&cloud.sh[1..], [[-127.0 / 128.0, 0.0, 1.0], [-0.5, 0.0, 0.0], [0.0, -0.5, 0.0]], "{what}");
+    assert_eq!(&cloud.sh[1..], [[127.0 / 128.0, 0.0, -1.0], [0.5, 0.0, 0.0], [0.0, -0.5, 0.0]], "{what}");
 }
 
 #[test]
@@ -386,7 +384,7 @@ fn spz_of_versions_2_and_3_by_hand() {
     // Version 2: x y z = 0.6, 0, 0 → 204, 127.5 is not a level: 128 stands for 1/255.
     let v2 = loaded("a.spz", &gzip(&spz_by_hand(2, &[204, 128, 127])));
     assert_is_the_one_by_hand(&v2, "version 2");
-    let expected = [0.8, 0.6, -1.0 / 255.0, 1.0 / 255.0];
+    let expected = [0.8, 0.6, 1.0 / 255.0, -1.0 / 255.0];
     assert!(rotation_error(v2.quats[0], expected) < 1e-4, "{:?}", v2.quats[0]);
     // Version 3: largest is w (index 3), x = −511 steps of ½√2, y and z 0: −90° about x.
     let word = 3_u32 << 30 | (1 << 9 | 511) << 20;
@@ -441,15 +439,16 @@ fn spz_of_version_4_by_hand_with_extensions() {
     assert_is_the_one_by_hand(&plain, "version 4");
     let record =
         |kind: u32, content: &[u8]| [&kind.to_le_bytes()[..], &(content.len() as u32).to_le_bytes(), content].concat();
-    // An unknown record is passed over and said; one that names RUB changes nothing.
-    let known = [record(0x1234_0001, b"hello"), record(0xadbe_0003, &[4, 0, 0, 0])].concat();
+    // An unknown record is passed over and said; one that names RDF changes nothing.
+    let known = [record(0x1234_0001, b"hello"), record(0xadbe_0003, &[6, 0, 0, 0])].concat();
     let (_dir, path) = file("a.spz", &spz4_by_hand(&known, &frames, &sizes));
     let (cloud, report) = load_with_report(&path).unwrap();
     assert_eq!(cloud, plain);
     assert!(report.notes.iter().any(|note| note.contains("0x12340001 (5 bytes)")), "{:?}", report.notes);
-    // One that names RDF leaves the axes as they are.
-    let rdf = loaded("a.spz", &spz4_by_hand(&record(0xadbe_0003, &[6, 0, 0, 0]), &frames, &sizes));
-    assert_eq!(rdf.means, [[1.0, -2.0, 0.5]]);
+    // From RUB y and z change their signs; Y₁₋₁ goes with y, Y₁₀ with z, Y₁₁ with x.
+    let rub = loaded("a.spz", &spz4_by_hand(&record(0xadbe_0003, &[4, 0, 0, 0]), &frames, &sizes));
+    assert_eq!(rub.means, [[1.0, 2.0, -0.5]]);
+    assert_eq!(&rub.sh[1..], [[-127.0 / 128.0, 0.0, 1.0], [-0.5, 0.0, 0.0], [0.0, -0.5, 0.0]]);
     let turned = message("a.spz", &spz4_by_hand(&record(0xadbe_0003, &[12, 0, 0, 0]), &frames, &sizes));
     assert!(turned.contains("coordinate system 12"), "{turned}");
     let long = [&0x1234_0001_u32.to_le_bytes()[..], &u32::MAX.to_le_bytes()].concat();
@@ -474,9 +473,9 @@ fn frames_of_the_reference_encoder_are_read() {
     bytes[12] = 0;
     let cloud = loaded("a.spz", &bytes);
     assert_eq!(cloud.len(), 250);
-    // Bytes 0 1 2, 3 4 5, 6 7 8 with 8 fractional bits, y and z turned.
+    // Bytes 0 1 2, 3 4 5, 6 7 8 with 8 fractional bits.
     let fixed = |bytes: [u8; 4]| i32::from_le_bytes(bytes) as f32 / 256.0;
-    assert_eq!(cloud.means[0], [fixed([0, 1, 2, 0]), -fixed([3, 4, 5, 0]), -fixed([6, 7, 8, 0])]);
+    assert_eq!(cloud.means[0], [[0, 1, 2, 0], [3, 4, 5, 0], [6, 7, 8, 0]].map(fixed));
     assert_eq!(cloud.log_scales[10], [30.0, 31.0, 32.0].map(|v: f32| v / 16.0 - 10.0));
 }
 

@@ -7,8 +7,6 @@ use crate::gaussian_cloud::GaussianCloud;
 pub(super) struct Axes([f32; 3]);
 
 impl Axes {
-    /// Right, up, back: OpenGL, SPZ.
-    pub const RUB: Self = Self([1.0, 1.0, 1.0]);
     /// Right, down, forward: OpenCV, 3DGS PLY.
     pub const RDF: Self = Self([1.0, -1.0, -1.0]);
 
@@ -63,7 +61,7 @@ mod tests {
 
     #[test]
     fn numbers_mean_what_their_bits_say() {
-        assert_eq!(Axes::of_number(4), Some(Axes::RUB));
+        assert_eq!(Axes::of_number(4), Some(Axes([1.0; 3])));
         assert_eq!(Axes::of_number(6), Some(Axes::RDF));
         assert_eq!(Axes::of_number(1), Some(Axes([-1.0, -1.0, 1.0])), "left, down, back");
         assert_eq!([0, 9, 16, 17].map(Axes::of_number), [None; 4]);

@@ -1,8 +1,10 @@
 //! SPZ, the compact format of Niantic: quantised attributes, one stream each, compressed.
 //!
 //! Versions 2 and 3 are one gzip stream, version 4 has a plain header and one zstd frame per attribute; all three are read,
-//! 3 and 4 are written. The axes of the file are right, up, back (RUB); those of a 3DGS PLY count as right, down, forward
-//! (RDF), as in the programs of the format's makers, so that y and z change their signs on the way in and out.
+//! 3 and 4 are written. Coordinates go in and out as they are. The format's description calls its axes right, up, back, but
+//! its own converter and `splat-transform` store those of the PLY file, and nothing here turns a model on the way (see
+//! CONVENTIONS.md); only a file with the extension that names its axes is brought to right, down, forward, as PLY files
+//! have them.
 //!
 //! | stream | stored as | error after a round trip |
 //! |---|---|---|
@@ -36,7 +38,7 @@ pub const MAX_FRACTIONAL_BITS: u32 = 16;
 pub enum SpzVersion {
     /// One gzip stream; every reader in circulation takes it.
     V3,
-    /// One zstd frame per attribute: faster to read, 10 to 20 % smaller.
+    /// One zstd frame per attribute: read in parallel. The encoder here is a fast one, its files are larger than gzip's.
     V4,
 }
 
@@ -128,7 +130,9 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<(GaussianCloud, PlyRepor
         notes.push("the model was trained for antialiased rendering".into());
     }
     let mut cloud = Packed::of_streams(&header, &streams).unpack();
-    axes::flip(&mut cloud, axes.unwrap_or(Axes::RUB).signs_to(Axes::RDF));
+    if let Some(axes) = axes {
+        axes::flip(&mut cloud, axes.signs_to(Axes::RDF));
+    }
     let unusable = UnusableRow::all_of(&cloud);
     let (cloud, report) = without_unusable(cloud, &unusable);
     Ok((cloud, report, notes))
@@ -158,9 +162,7 @@ pub fn save(path: impl AsRef<Path>, cloud: &GaussianCloud, options: SpzOptions) 
         SpzVersion::V4 => (4, [options.sh1_bits, options.sh_rest_bits]),
     };
     let header = Header { version, num_points: cloud.len(), sh_degree: cloud.sh_degree, fractional_bits, flags: 0 };
-    let mut turned = cloud.clone();
-    axes::flip(&mut turned, Axes::RDF.signs_to(Axes::RUB));
-    let (streams, num_clamped) = packed::pack(&turned, fractional_bits, bits);
+    let (streams, num_clamped) = packed::pack(cloud, fractional_bits, bits);
     super::write_atomically(path.as_ref(), |out| match options.version {
         SpzVersion::V3 => container::write_gzip(out, &header, &streams),
         SpzVersion::V4 => container::write_zstd(out, &header, &streams),

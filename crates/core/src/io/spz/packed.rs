@@ -102,7 +102,7 @@ pub(super) fn fractional_bits(cloud: &GaussianCloud) -> Result<u32> {
     })
 }
 
-/// The streams of `cloud`, which is in the axes of the file, and how many values were clamped.
+/// The streams of `cloud`, and how many values were clamped.
 pub(super) fn pack(cloud: &GaussianCloud, fractional_bits: u32, sh_bits: [u32; 2]) -> ([Vec<u8>; 6], usize) {
     let n = cloud.len();
     let mut num_clamped = 0;

@@ -1,8 +1,9 @@
 //! `gazesplat eval`: how close a model comes to the photographs of a scene.
 
 use super::device::ComputeDevice;
+use super::quality::{self, ImageFiles};
 use super::termination::TerminationArgs;
-use super::{Model, Split, load_scene, log_machine, quality};
+use super::{Model, Split, load_scene, log_machine};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, grouped};
 use crate::diagnostics::{Failure, Result};
@@ -20,6 +21,7 @@ Examples:
   gazesplat eval runs/fox-1 --scene fox
   gazesplat eval model.ply --scene fox --split all --set data.max_side=480 > eval.json
   gazesplat eval runs/fox-1 --scene fox --min-psnr 25 || echo worse than 25 dB
+  gazesplat eval runs/fox-1 --scene fox --save-images looks
   gazesplat eval runs/fox-1 --scene fox --device gpu
 
 A run is measured with the settings it was trained with (image size, split, background), a PLY
@@ -48,6 +50,9 @@ pub struct EvalArgs {
     /// Exit with status 1 when the mean PSNR is below this many dB
     #[arg(long, value_name = "DB")]
     pub min_psnr: Option<f64>,
+    /// Write the render of every view and a map of its errors below this directory: `renders`, `errors`
+    #[arg(long, value_name = "DIR")]
+    pub save_images: Option<PathBuf>,
     /// Write the JSON to this file too
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
@@ -68,12 +73,13 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
     let config = model.settings(&args.settings)?;
     let dataset = load_scene(&args.scene, &config, console)?;
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
+    let files = args.save_images.as_ref().map(|dir| ImageFiles::create(dir, &images)).transpose()?;
     let report = with_threads(config.train.threads, || {
         log_machine();
         let options = RenderOptions { termination: args.termination.termination()?, ..config.render_options() };
         device.guard(|| {
             let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-            quality::measure(&splats, &images, &options, console)
+            quality::measure_and_save(&splats, &images, &options, files.as_ref(), console)
         })
     })??;
     tracing::info!("images in memory: {} of {}", bytes(images.num_bytes() as u64), images.len());

@@ -221,3 +221,18 @@ fn a_colmap_model_is_preferred_and_a_json_file_can_be_given() {
     let data = Dataset::load(scene.at("transforms.json"), &LoadOptions::default()).unwrap();
     assert_eq!((data.source, data.all_views().len()), (SceneFormat::Transforms, 1));
 }
+
+#[test]
+fn names_with_blanks_and_of_any_language_are_found() {
+    let names = ["images/zwei Wörter.png", "images/東京/写真 1.png", "images\\☃ (копия).png"];
+    let frames: Vec<Value> = names.iter().zip([0.0, 1.0, 2.0]).map(|(name, x)| frame(name, x)).collect();
+    let scene = Scene::new();
+    scene.write("transforms.json", json!({ "fl_x": 20.0, "frames": frames }).to_string());
+    for name in names {
+        scene.write_image(&name.replace('\\', "/"), [20, 10]);
+    }
+    let data = load(&scene).unwrap();
+    assert_eq!(data.warnings, Vec::<String>::new());
+    let found: Vec<String> = data.all_views().iter().map(|view| view.name.clone()).collect();
+    assert_eq!(found, ["zwei Wörter.png", "☃ (копия).png", "東京/写真 1.png"]);
+}

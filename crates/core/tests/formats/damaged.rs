@@ -33,6 +33,23 @@ proptest! {
         }
     }
 
+    /// Behind a container that is whole, where checksums catch nothing.
+    #[test]
+    fn any_content_of_a_whole_container_never_panics(
+        version in 2u32..=3, count in 0u32..6, degree in 0u8..6, bits in 0u8..26, flags: u8,
+        content in proptest::collection::vec(any::<u8>(), 0..700),
+    ) {
+        let mut bytes = b"NGSP".to_vec();
+        bytes.extend(version.to_le_bytes());
+        bytes.extend(count.to_le_bytes());
+        bytes.extend([degree, bits, flags, 0]);
+        bytes.extend(content);
+        let (_dir, path) = file("a.spz", &gzip(&bytes));
+        if let Ok((model, report)) = load_with_report(&path) {
+            prop_assert!(model.validate().is_ok() && report.num_rows == count as usize);
+        }
+    }
+
     #[test]
     fn foreign_bytes_never_panic(start in 0usize..4, bytes in proptest::collection::vec(any::<u8>(), 0..400)) {
         let heads: [&[u8]; 4] = [b"NGSP\x04\0\0\0", &[0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3], b"ply\n", b""];

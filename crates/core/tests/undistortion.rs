@@ -7,7 +7,7 @@ use gazesplat_core::camera::distortion::{LensDistortion, LensModel};
 /// What the maps are held to, in pixels.
 const MAX_ERROR_PX: f64 = 0.05;
 
-/// Where COLMAP's camera model `name` with `params` (focal lengths, principal point, coefficients in COLMAP's order) shows
+/// Where COLMAP's (or nerfstudio's) camera model `name` with `params` (focal lengths, principal point, coefficients in COLMAP's order) shows
 /// the ray (u, v, 1), in pixels. From the formulas in COLMAP's documentation of its models and OpenCV's of its own.
 fn project(name: &str, params: &[f64], u: f64, v: f64) -> [f64; 2] {
     let single =
@@ -37,6 +37,11 @@ fn project(name: &str, params: &[f64], u: f64, v: f64) -> [f64; 2] {
             let above = 1.0 + k[0] * r.powi(2) + k[1] * r.powi(4) + k[4] * r.powi(6);
             let below = 1.0 + k[5] * r.powi(2) + k[6] * r.powi(4) + k[7] * r.powi(6);
             brown(u, v, above / below, k[2], k[3])
+        }
+        // Of nerfstudio's `camera_utils`, with the coefficients in the order k1, k2, p1, p2, k3, k4.
+        "PERSPECTIVE" => {
+            let radial = 1.0 + k[0] * r.powi(2) + k[1] * r.powi(4) + k[4] * r.powi(6) + k[5] * r.powi(8);
+            brown(u, v, radial, k[2], k[3])
         }
         "OPENCV_FISHEYE" => {
             of_angle(theta + k[0] * theta.powi(3) + k[1] * theta.powi(5) + k[2] * theta.powi(7) + k[3] * theta.powi(9))
@@ -75,6 +80,8 @@ fn lenses() -> Vec<(&'static str, Vec<f64>)> {
         ("OPENCV", double(230.0, 236.0, &[-0.31, 0.12, 0.012, -0.009])),
         ("FULL_OPENCV", double(310.0, 305.0, &[0.1, -0.02, 0.001, 0.002, 0.003, 0.05, 0.01, 0.001])),
         ("FULL_OPENCV", double(220.0, 226.0, &[0.3, 0.1, -0.006, 0.008, 0.02, 0.6, 0.3, 0.05])),
+        ("PERSPECTIVE", double(310.0, 305.0, &[0.05, -0.04, 0.001, 0.002, 0.01, -0.002])),
+        ("PERSPECTIVE", double(230.0, 236.0, &[-0.3, 0.12, 0.008, -0.006, -0.02, 0.01])),
         ("OPENCV_FISHEYE", double(300.0, 297.0, &[0.02, -0.01, 0.003, -0.001])),
         ("OPENCV_FISHEYE", double(200.0, 198.0, &[-0.06, 0.02, -0.01, 0.002])),
         ("SIMPLE_RADIAL_FISHEYE", single(300.0, &[0.03])),
@@ -89,7 +96,7 @@ fn lenses() -> Vec<(&'static str, Vec<f64>)> {
 }
 
 fn lens(name: &str, params: &[f64]) -> LensDistortion {
-    let model = LensModel::from_name(name).expect("a model of COLMAP");
+    let model = LensModel::from_name(name).unwrap_or(LensModel::Perspective);
     let num_focal = if model.has_single_focal() { 1 } else { 2 };
     let mut coefficients = [0.0; 8];
     coefficients[..params.len() - num_focal - 2].copy_from_slice(&params[num_focal + 2..]);

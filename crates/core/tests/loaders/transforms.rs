@@ -81,7 +81,9 @@ fn camera_models_and_coefficients_are_understood() {
         let found = lens(fisheye).unwrap();
         assert_eq!((found.model, found.coefficients[3]), (LensModel::OpenCvFisheye, 0.01));
     }
-    for (name, words) in [("EQUIRECTANGULAR", "EQUIRECTANGULAR"), ("OPENCV", "k4 = 0.5")] {
+    let found = lens(json!({"camera_model": "OPENCV", "k1": 0.1, "k4": 0.01})).unwrap();
+    assert_eq!((found.model, &found.coefficients[..6]), (LensModel::Perspective, &[0.1, 0.0, 0.0, 0.0, 0.0, 0.01][..]));
+    for (name, words) in [("EQUIRECTANGULAR", "EQUIRECTANGULAR"), ("PERSPECTIVE", "PERSPECTIVE")] {
         let content = json!({"camera_model": name, "fl_x": 15.0, "k4": 0.5, "frames": [frame("a.png", 0.0)]});
         let error = load(&scene(&content)).unwrap_err();
         assert!(matches!(error, Error::Unsupported { .. }));

@@ -134,11 +134,19 @@ impl RunDir {
         write_text(&self.settings_path(), &text)
     }
 
-    /// Writes `point_cloud.ply`, whose header names the program and holds `provenance`, a line each.
+    /// Writes `point_cloud.ply`, whose header names the program.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn write_model(&self, cloud: &GaussianCloud, provenance: &[String]) -> Result<()> {
+    pub fn write_model(&self, cloud: &GaussianCloud) -> Result<()> {
+        self.write_model_with(cloud, &[])
+    }
+
+    /// As [`RunDir::write_model`]; the header also holds `provenance`, a comment line each.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write_model_with(&self, cloud: &GaussianCloud, provenance: &[String]) -> Result<()> {
         let comments = [&[generator()], provenance].concat();
         Ok(gazesplat_core::io::ply::save_with_comments(self.model_path(), cloud, &comments)?)
     }

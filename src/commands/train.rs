@@ -185,7 +185,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         }
         (Err(failure), _) | (Ok(_), Err(failure)) => return Err(salvage(failure, &run_dir, kept)),
     };
-    run_dir.write_model(&cloud, &provenance(job, &dataset, num_steps))?;
+    run_dir.write_model_with(&cloud, &provenance(job, &dataset, num_steps))?;
     run_dir.remove_unfinished()?;
     if outcome == Outcome::Stopped {
         console.note(format_args!("stopped after {num_steps} of {} steps, saving what there is", config.train.steps));

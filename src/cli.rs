@@ -1,6 +1,6 @@
 //! The command line: what is accepted, explained, and which command it becomes. Nothing is opened here.
 
-use crate::commands::{bench, demo, eval, hvsq, info, lut, prune, render, synth, train};
+use crate::commands::{bench, convert, demo, eval, hvsq, info, lut, prune, render, synth, train};
 use crate::console::Console;
 use crate::diagnostics::Result;
 use crate::settings;
@@ -20,7 +20,7 @@ use tracing_subscriber::EnvFilter;
     after_help = "\
 SCENE is a COLMAP directory (`sparse/0` in .bin or .txt, beside `images`), a directory with
 `transforms.json` (nerfstudio, instant-ngp, NeRF-synthetic), or made by `gazesplat synth`.
-MODEL is a 3DGS PLY file, or the directory of a run.
+MODEL is the directory of a run, or a file: 3DGS PLY, compressed PLY, `.splat` or SPZ.
 
 Examples:
   gazesplat demo                                       see everything work, in a few minutes
@@ -71,6 +71,8 @@ pub enum Command {
     Demo(demo::DemoArgs),
     /// Say what is in a model, a scene, a camera path or a run; or which devices there are
     Info(info::InfoArgs),
+    /// Write a model in another format: PLY, compressed PLY, `.splat` or SPZ
+    Convert(convert::ConvertArgs),
     /// Write a table of the transmittances at which a pixel may stop, from colour science
     Lut(lut::LutArgs),
     /// Measure what a part of the program gains and costs
@@ -106,6 +108,7 @@ pub fn run() -> Result<()> {
         Command::Synth(args) => synth::command(&args, &console),
         Command::Demo(args) => demo::command(&args, &console),
         Command::Info(args) => info::command(&args, &console),
+        Command::Convert(args) => convert::command(&args, &console),
         Command::Lut(args) => lut::command(&args, &console),
         Command::Bench(args) => bench::command(&args, &console),
     }

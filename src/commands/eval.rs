@@ -2,19 +2,19 @@
 
 use super::device::ComputeDevice;
 use super::hvsq_args::{self, HvsqArgs, Measured, Measures};
+use super::quality::{self, ImageFiles};
 use super::termination::TerminationArgs;
-use super::{Model, Split, load_scene, log_machine, quality};
+use super::{Model, Split, load_scene, log_machine};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, grouped};
 use crate::diagnostics::{Failure, Result};
-use crate::progress;
 use crate::run_dir;
 use clap::Args;
 use gazesplat_core::ImageF32;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_render::{RenderOptions, Splats};
 use gazesplat_train::losses::LossTarget;
-use gazesplat_train::{EvalReport, with_threads};
+use gazesplat_train::{EvalReport, ViewScore, with_threads};
 use serde::Serialize;
 use std::path::PathBuf;
 
@@ -25,6 +25,7 @@ Examples:
   gazesplat eval runs/fox-1 --scene fox
   gazesplat eval model.ply --scene fox --split all --set data.max_side=480 > eval.json
   gazesplat eval runs/fox-1 --scene fox --min-psnr 25 || echo worse than 25 dB
+  gazesplat eval runs/fox-1 --scene fox --save-images looks
   gazesplat eval runs/fox-1 --scene fox --device gpu
   gazesplat eval runs/fox-1 --scene fox --hvsq 1,3,7,12 --gaze 0.5,0.5
 
@@ -34,7 +35,7 @@ file with the defaults.
 Gaussians with a value that is not finite are left out, with a warning that names the file and
 their number; a model without any other is refused.")]
 pub struct EvalArgs {
-    /// A 3DGS PLY file, or the directory of a run
+    /// A model file (PLY, compressed PLY, `.splat`, SPZ), or the directory of a run
     pub model: PathBuf,
     /// The scene with the photographs
     #[arg(long, value_name = "SCENE")]
@@ -57,6 +58,9 @@ pub struct EvalArgs {
     /// Exit with status 1 when the mean PSNR is below this many dB
     #[arg(long, value_name = "DB")]
     pub min_psnr: Option<f64>,
+    /// Write the render of every view and a map of its errors below this directory: `renders`, `errors`
+    #[arg(long, value_name = "DIR")]
+    pub save_images: Option<PathBuf>,
     /// Write the JSON to this file too
     #[arg(long, value_name = "FILE")]
     pub out: Option<PathBuf>,
@@ -78,18 +82,13 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
     let dataset = load_scene(&args.scene, &config, console)?;
     let measures = args.hvsq.measures()?;
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
+    let files = args.save_images.as_ref().map(|dir| ImageFiles::create(dir, &images)).transpose()?;
     let report = with_threads(config.train.threads, || {
         log_machine();
         let options = RenderOptions { termination: args.termination.termination()?, ..config.render_options() };
         device.guard(|| {
             let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-            match &measures {
-                None => Ok((quality::measure(&splats, &images, &options, console)?, None)),
-                Some(measures) => {
-                    let (report, hvsq) = measure_hvsq(args, measures, &splats, &images, &options, console)?;
-                    Ok::<_, Failure>((report, Some(hvsq)))
-                }
-            }
+            measure(args, measures.as_ref(), files.as_ref(), &splats, &images, &options, console)
         })
     })??;
     let (report, hvsq) = report;
@@ -147,46 +146,41 @@ impl<'a> From<&'a HvsqOfViews> for HvsqReport<'a> {
     }
 }
 
-/// Measures every view in both ways; writes the map of the view that differs most in the last measure.
-fn measure_hvsq(
+/// Measures every view in all ways that were asked for, keeps what was compared in `files`, and writes the map of the view
+/// that differs most in the last measure.
+fn measure(
     args: &EvalArgs,
-    measures: &Measures,
+    measures: Option<&Measures>,
+    files: Option<&ImageFiles>,
     splats: &Splats,
     images: &ImageCache,
     options: &RenderOptions,
     console: &Console,
-) -> Result<(EvalReport, Vec<(String, Measured)>)> {
-    let bar = progress::counting_bar(console, "measuring", images.len());
+) -> Result<(EvalReport, Option<Vec<(String, Measured)>>)> {
     let mut views: Vec<(String, Measured)> = Vec::with_capacity(images.len());
     let mut worst: Option<(f64, ImageF32, LossTarget)> = None;
-    let mut failure = None;
-    let report = gazesplat_train::evaluate(splats, images, options, &mut |score, image| {
-        bar.inc(1);
-        if failure.is_some() {
-            return;
+    let mut each = |index: usize, score: &ViewScore, image: &ImageF32| -> Result<()> {
+        if files.is_none() && measures.is_none() {
+            return Ok(());
         }
-        let measured = images
-            .get(views.len())
-            .map_err(Failure::from)
-            .map(|photo| LossTarget::new(photo, options.background))
-            .and_then(|target| Ok((measures.measure(image, &target)?, target)));
-        match measured {
-            Ok((measured, target)) => {
-                let value = measured.hvsq.last().map_or(0.0, |v| v.value);
-                if args.hvsq.hvsq_map.is_some() && worst.as_ref().is_none_or(|(most, ..)| value > *most) {
-                    worst = Some((value, image.clone(), target));
-                }
-                views.push((score.name.clone(), measured));
+        let photo = images.get(index)?;
+        if let Some(files) = files {
+            files.write(index, image, &photo, options)?;
+        }
+        if let Some(measures) = measures {
+            let target = LossTarget::new(photo, options.background);
+            let measured = measures.measure(image, &target)?;
+            let value = measured.hvsq.last().map_or(0.0, |v| v.value);
+            if args.hvsq.hvsq_map.is_some() && worst.as_ref().is_none_or(|(most, ..)| value > *most) {
+                worst = Some((value, image.clone(), target));
             }
-            Err(error) => failure = Some(error),
+            views.push((score.name.clone(), measured));
         }
-    })?;
-    bar.finish_and_clear();
-    if let Some(failure) = failure {
-        return Err(failure);
-    }
-    if let (Some(path), Some((_, image, target))) = (&args.hvsq.hvsq_map, &worst) {
+        Ok(())
+    };
+    let report = quality::measure_each(splats, images, options, &mut each, console)?;
+    if let (Some(measures), Some(path), Some((_, image, target))) = (measures, &args.hvsq.hvsq_map, &worst) {
         measures.write_map(path, image, target, console)?;
     }
-    Ok((report, views))
+    Ok((report, measures.map(|_| views)))
 }

@@ -38,7 +38,7 @@ pub(crate) fn write_pngs(
 }
 
 /// `<stem>.png` for each camera.
-fn png_names(cameras: &[NamedCamera]) -> Result<Vec<String>> {
+pub(crate) fn png_names(cameras: &[NamedCamera]) -> Result<Vec<String>> {
     let mut first_with: HashMap<String, &str> = HashMap::new();
     let mut files = Vec::with_capacity(cameras.len());
     for (name, _) in cameras {

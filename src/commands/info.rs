@@ -30,7 +30,7 @@ numbered as `--device gpu:N` counts them, with the limits that matter and whethe
 A software driver computes on the CPU: it is for tests."
 )]
 pub struct InfoArgs {
-    /// A PLY file, a scene, a camera path (JSON), or the directory of a run
+    /// A model file, a point cloud (PLY), a scene, a camera path (JSON), or the directory of a run
     pub path: Option<PathBuf>,
     /// Tell what `--device` can name on this machine
     #[arg(long)]
@@ -95,13 +95,19 @@ fn file(path: &Path, facts: &mut Facts, console: &Console) -> Result<()> {
     if is_json {
         return scene(path, facts, console);
     }
-    let has_points_only = head.starts_with("ply") && !head.contains("f_dc_0") && !head.contains("opacity");
+    let is_of_gaussians = ["f_dc_0", "opacity", "packed_position"].iter().any(|property| head.contains(property));
+    let has_points_only = head.starts_with("ply") && !is_of_gaussians;
     if has_points_only {
         return points(path, &ply::load_points(path)?, facts);
     }
     let model = Model::load(path, console)?;
     facts.add("kind", "model", "3D Gaussian model", path.display().to_string());
+    let format = model.report.format.kind();
+    facts.add("format", format, "format", format);
     model_facts(&model, facts);
+    if !model.report.comments.is_empty() {
+        facts.add("comments", model.report.comments.clone(), "comments", model.report.comments.join("; "));
+    }
     Ok(())
 }
 

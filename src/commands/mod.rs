@@ -1,6 +1,7 @@
 //! The commands of the program, one file each, and what several of them share: scenes, models, threads.
 
 pub mod bench;
+pub mod convert;
 pub mod demo;
 pub mod device;
 pub mod eval;
@@ -26,7 +27,7 @@ use crate::diagnostics::{Failure, Result};
 use crate::run_dir::RunDir;
 use crate::settings::Settings;
 use gazesplat_core::dataset::LoadOptions;
-use gazesplat_core::io::ply;
+use gazesplat_core::io::model::{self, ModelReport};
 use gazesplat_core::{Dataset, GaussianCloud, View};
 use gazesplat_render::cluster::morton_order;
 use gazesplat_render::simd::{self, SimdLevel};
@@ -102,21 +103,26 @@ pub fn scene_name(scene: &Path) -> String {
 pub struct Model {
     /// The Gaussians.
     pub cloud: GaussianCloud,
-    /// The PLY file.
+    /// The file it was read from.
     pub path: PathBuf,
+    /// What the file held besides.
+    pub report: ModelReport,
     /// The run it was given as, if it was a directory.
     pub run: Option<RunDir>,
 }
 
 impl Model {
-    /// Reads a PLY file, or the model of a run directory.
+    /// Reads a model file of any format, or the model of a run directory.
     ///
     /// # Errors
     /// When there is no model at `path`, or it cannot be read.
     pub fn load(path: &Path, console: &Console) -> Result<Self> {
         let run = if path.is_dir() { Some(RunDir::open(path)?) } else { None };
         let file = run.as_ref().map_or_else(|| path.to_owned(), RunDir::model_path);
-        let (cloud, report) = ply::load_with_report(&file)?;
+        let (cloud, report) = model::load_with_report(&file)?;
+        for note in &report.notes {
+            console.warn(format_args!("`{}`: {note}", file.display()));
+        }
         if report.num_dropped_non_finite > 0 {
             console.warn(format_args!(
                 "`{}`: left out {} of {} Gaussians with values that are not finite",
@@ -133,7 +139,7 @@ impl Model {
                 grouped(report.num_rows)
             ));
         }
-        Ok(Self { cloud, path: file, run })
+        Ok(Self { cloud, path: file, report, run })
     }
 
     /// Reads a model as [`Model::load`] does, to go on training it.

@@ -1,13 +1,18 @@
 //! Measuring a model on the photographs of some views, and choosing a few of them to look at.
 
-use super::frames;
+use super::frames::{self, NamedCamera};
 use crate::console::Console;
 use crate::diagnostics::Result;
 use crate::progress;
 use crate::report::ViewPanel;
-use gazesplat_core::io::images::ImageCache;
+use crate::report::pictures::error_map;
+use crate::run_dir::create_all;
+use gazesplat_core::ImageF32;
+use gazesplat_core::io::images::{ImageCache, TrainingImage};
+use gazesplat_core::io::save_png;
 use gazesplat_render::{RenderOptions, Splats};
-use gazesplat_train::EvalReport;
+use gazesplat_train::{EvalReport, ViewScore};
+use std::path::{Path, PathBuf};
 
 /// Views shown with pictures, as ranks among all by PSNR from the worst (0) to the best (1): the typical one first.
 const PANEL_RANKS: [f64; 5] = [0.5, 0.0, 1.0, 0.25, 0.75];
@@ -19,10 +24,73 @@ pub(crate) fn measure(
     options: &RenderOptions,
     console: &Console,
 ) -> Result<EvalReport> {
+    measure_each(splats, images, options, &mut |_, _, _| Ok(()), console)
+}
+
+/// Measures every view of `images`; `each` gets its number, its score and its render, and is not called again after it has
+/// failed: a disk that refuses one file refuses the next.
+///
+/// # Errors
+/// Those of the measurement, else that of `each`.
+pub(crate) fn measure_each(
+    splats: &Splats,
+    images: &ImageCache,
+    options: &RenderOptions,
+    each: &mut dyn FnMut(usize, &ViewScore, &ImageF32) -> Result<()>,
+    console: &Console,
+) -> Result<EvalReport> {
     let bar = progress::counting_bar(console, "measuring", images.len());
-    let report = gazesplat_train::evaluate(splats, images, options, &mut |_, _| bar.inc(1))?;
+    let (mut index, mut done) = (0, Ok(()));
+    let report = gazesplat_train::evaluate(splats, images, options, &mut |score, render| {
+        if done.is_ok() {
+            done = each(index, score, render);
+        }
+        index += 1;
+        bar.inc(1);
+    })?;
     bar.finish_and_clear();
-    Ok(report)
+    done.map(|()| report)
+}
+
+/// Where renders and error maps of measured views go.
+pub(crate) struct ImageFiles {
+    renders: PathBuf,
+    errors: PathBuf,
+    names: Vec<String>,
+}
+
+impl ImageFiles {
+    /// Makes `dir/renders` and `dir/errors` for the views of `images`, before anything is measured.
+    ///
+    /// # Errors
+    /// When a directory cannot be made, or two views would share a file.
+    pub(crate) fn create(dir: &Path, images: &ImageCache) -> Result<Self> {
+        let cameras: Vec<NamedCamera> = images.views().iter().map(|v| (v.name.clone(), v.camera)).collect();
+        let names = frames::png_names(&cameras).map_err(|failure| failure.hint("rename one of the two images"))?;
+        let [renders, errors] = ["renders", "errors"].map(|name| dir.join(name));
+        create_all(&renders)?;
+        create_all(&errors)?;
+        Ok(Self { renders, errors, names })
+    }
+
+    /// Writes the render of view `index` and its difference to `photo`, dark where the mask leaves no loss.
+    pub(crate) fn write(
+        &self,
+        index: usize,
+        render: &ImageF32,
+        photo: &TrainingImage,
+        options: &RenderOptions,
+    ) -> Result<()> {
+        let render = render.to_rgb8();
+        let mut errors = error_map(&photo.composited(options.background), &render);
+        if let Some(mask) = &photo.mask {
+            let hidden = errors.data.chunks_exact_mut(3).zip(mask).filter(|(_, counts)| **counts == 0);
+            hidden.for_each(|(pixel, _)| pixel.fill(0));
+        }
+        let name = &self.names[index];
+        save_png(self.renders.join(name), &render)?;
+        Ok(save_png(self.errors.join(name), &errors)?)
+    }
 }
 
 /// Some of the measured views of `images` beside their renders: the typical, the worst, the best and two between.

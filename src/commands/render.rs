@@ -36,7 +36,7 @@ Gaussians with a value that is not finite are left out, with a warning that name
 their number; a model without any other is refused."
 )]
 pub struct RenderArgs {
-    /// A 3DGS PLY file, or the directory of a run
+    /// A model file (PLY, compressed PLY, `.splat`, SPZ), or the directory of a run
     pub model: PathBuf,
     /// Draw the views of this scene; its photographs are not decoded
     #[arg(long, value_name = "SCENE")]

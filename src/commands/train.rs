@@ -206,7 +206,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         }
         (Err(failure), _) | (Ok(_), Err(failure)) => return Err(salvage(failure, &run_dir, kept)),
     };
-    run_dir.write_model(&cloud)?;
+    run_dir.write_model_with(&cloud, &provenance(job, &dataset, num_steps))?;
     run_dir.remove_unfinished()?;
     if outcome == Outcome::Stopped {
         console.note(format_args!("stopped after {num_steps} of {} steps, saving what there is", config.train.steps));
@@ -297,6 +297,22 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
         Ok(()) => failure.hint_first(format!("the model as it was after step {step} is in `{}`", path.display())),
         Err(_) => failure,
     }
+}
+
+/// Where a model comes from, for the header of its file. The frame is that of the reconstruction; the extent is what
+/// learning rates and distances were measured in. Nothing of the machine and no time: equal runs give equal files.
+fn provenance(job: &TrainJob<'_>, dataset: &Dataset, num_steps: u32) -> Vec<String> {
+    vec![
+        format!("Scene: {}, {}", scene_name(job.scene), dataset.source),
+        format!(
+            "Trained: {num_steps} steps, seed {}, on {} views; {} test views{}",
+            job.config.train.seed,
+            dataset.train.len(),
+            dataset.test.len(),
+            held_out(dataset)
+        ),
+        format!("Extent of the cameras: {} world units", dataset.scene_extent()),
+    ]
 }
 
 fn facts(

@@ -65,3 +65,36 @@ fn closed_pipe_is_no_failure() {
     assert!(output.status.success(), "{:?}", output.status);
     assert_eq!(String::from_utf8_lossy(&output.stderr), "");
 }
+
+#[test]
+fn renders_and_error_maps_are_saved() {
+    let place = Place::with_run();
+    let plain = place.run(&["eval", "run", "--scene", "scene"]).done();
+    let ended = place.run(&["eval", "run", "--scene", "scene", "--save-images", "new/looks"]).done();
+    assert_eq!(ended.stdout, plain.stdout, "the figures are the same");
+    let names = ["view_000.png", "view_008.png"];
+    assert_eq!(
+        (place.list("new/looks/renders"), place.list("new/looks/errors")),
+        (names.map(String::from).to_vec(), names.map(String::from).to_vec())
+    );
+    let read = |path: String| gazesplat_core::io::images::decode_rgb(place.path(&path)).expect("a PNG");
+    for name in names {
+        let (photo, render) = (read(format!("scene/images/{name}")), read(format!("new/looks/renders/{name}")));
+        let errors = read(format!("new/looks/errors/{name}"));
+        assert_eq!((errors.width, errors.height), (photo.width, photo.height));
+        // Brightness follows the difference: the brightest pixel of the map is one of the worst.
+        let sum = |image: &gazesplat_core::RgbImage8, i: usize| {
+            image.data[3 * i..3 * i + 3].iter().map(|&v| u32::from(v)).sum::<u32>()
+        };
+        let difference = |i: usize| -> u32 {
+            (0..3).map(|c| u32::from(photo.data[3 * i + c].abs_diff(render.data[3 * i + c]))).sum()
+        };
+        let brightest = (0..photo.num_pixels()).max_by_key(|&i| sum(&errors, i)).expect("pixels");
+        let darkest = (0..photo.num_pixels()).min_by_key(|&i| sum(&errors, i)).expect("pixels");
+        assert!(difference(brightest) > difference(darkest), "{name}");
+    }
+    place.write("file", "mine");
+    let said = place.run(&["eval", "run", "--scene", "scene", "--save-images", "file"]).refused();
+    assert!(said.contains("file"), "{said}");
+    assert_eq!(place.read("file"), "mine");
+}

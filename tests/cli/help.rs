@@ -2,7 +2,8 @@
 
 use crate::support::Place;
 
-const COMMANDS: [&str; 9] = ["train", "eval", "hvsq", "render", "synth", "demo", "info", "lut", "bench"];
+const COMMANDS: [&str; 11] =
+    ["train", "prune", "eval", "hvsq", "render", "synth", "demo", "info", "convert", "lut", "bench"];
 
 #[test]
 fn help_names_every_command_and_the_exit_statuses() {

@@ -124,8 +124,8 @@ pub(crate) struct Scene {
 const EXTENT_MARGIN: f32 = 1.1;
 
 impl Dataset {
-    /// Reads the scene at `path`: a directory with a COLMAP model (`sparse/0`, `sparse`, `colmap/sparse/0` or the
-    /// directory itself; `.bin` preferred to `.txt`), else with `transforms.json`, else with `transforms_train.json`; or
+    /// Reads the scene at `path`: a directory with a COLMAP model (the largest of `sparse/0`, `sparse/1`, …;
+    /// `sparse`, `colmap/sparse/0` or the directory itself; `.bin` preferred to `.txt`), else with `transforms.json`, else with `transforms_train.json`; or
     /// one of these JSON files itself. Images are not decoded, only their sizes are read.
     ///
     /// # Errors
@@ -139,8 +139,8 @@ impl Dataset {
                 return Err(not_a_scene(path, "a file, but no JSON file"));
             }
             transforms::load_scene(path, options)?
-        } else if let Some(model) = colmap::find_model(path) {
-            colmap::load_scene(path, &model, options)?
+        } else if let Some((model, choice)) = colmap::choose_model(path) {
+            colmap::load_scene(path, (&model, choice), options)?
         } else if let Some(file) =
             ["transforms.json", transforms::TRAIN_FILE].map(|f| path.join(f)).into_iter().find(|f| f.exists())
         {

@@ -42,7 +42,7 @@ Writes termination.csv, termination.json, error_over_time.svg, quality_over_gamm
 first view two maps for the strict table at γ = 1: delta_e.png, the difference from the full image
 (0 black, 1 just-noticeable difference pale yellow), and left.png, the transmittance left over.")]
 pub struct StudyArgs {
-    /// A 3DGS PLY file, or the directory of a run
+    /// A model file (PLY, compressed PLY, `.splat`, SPZ), or the directory of a run
     pub model: PathBuf,
     /// The scene with the photographs
     #[arg(long, value_name = "SCENE")]

@@ -15,7 +15,7 @@ use gazesplat_core::{GaussianCloud, RgbImage8, View};
 use gazesplat_render::cluster::morton_order;
 use gazesplat_render::{RenderOptions, Splats, StatsMode, render};
 use gazesplat_train::EvalReport;
-use gazesplat_train::prune::{Basis, Outcome, Reference, Status};
+use gazesplat_train::prune::{Basis, Outcome, Plan, Reference, Status};
 use serde::Serialize;
 
 /// Views shown with pictures.
@@ -128,7 +128,7 @@ impl Run<'_> {
             self.dir.write_curve(svg)?;
         }
         run_dir.write_report(&html::page(&report))?;
-        run_dir.write_model(&cloud)?;
+        run_dir.write_model_with(&cloud, &self.provenance(&result))?;
         self.dir.append_result(&result)?;
         self.dir.remove_scaffolding()?;
         self.console.note(format_args!(
@@ -150,6 +150,25 @@ impl Run<'_> {
         ));
         self.console.note(format_args!("look at `{}`", self.dir.run_dir().report_path().display()));
         self.console.json(&result)
+    }
+
+    /// Where the model comes from, for the header of its file: equal runs give equal files.
+    fn provenance(&self, result: &ResultLine) -> Vec<String> {
+        let Plan { prune, adapt, .. } = *self.pruner.plan();
+        vec![
+            format!("Scene: {}, {}", super::scene_name(&self.scene), self.stage.dataset.source),
+            format!(
+                "Pruned: {} of {} Gaussians by {}, {} steps, seed {}, at most {} of the quality lost on {} views ({})",
+                result.points,
+                result.points_dense,
+                self.config.prune.criterion,
+                prune + adapt,
+                self.config.prune.seed,
+                self.config.guard.loss,
+                self.stage.split.guard.len(),
+                self.stage.split.views.name()
+            ),
+        ]
     }
 
     fn sections(&self, result: &ResultLine, curve: Option<String>, panels: Vec<PictureRow>) -> Vec<Section> {

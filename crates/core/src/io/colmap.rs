@@ -43,18 +43,57 @@ pub(super) const BINARY_FILES: [&str; 3] = ["cameras.bin", "images.bin", "points
 /// As [`BINARY_FILES`], for the text format.
 pub(super) const TEXT_FILES: [&str; 3] = ["cameras.txt", "images.txt", "points3D.txt"];
 
-/// The directory of the COLMAP model of the scene directory `scene`, if it has one: `sparse/0`, `sparse`,
-/// `colmap/sparse/0` or `scene` itself.
+/// The directory of the COLMAP model of the scene directory `scene`, if it has one: the largest of the numbered ones in
+/// `sparse` (`sparse/0`, …), `sparse` itself, the largest in `colmap/sparse`, or `scene` itself.
 pub fn find_model(scene: &Path) -> Option<PathBuf> {
-    let is_model = |dir: &PathBuf| {
-        [BINARY_FILES, TEXT_FILES]
-            .iter()
-            .any(|[cameras, images, _]| dir.join(cameras).exists() || dir.join(images).exists())
-    };
-    ["sparse/0", "sparse", "colmap/sparse/0", ""]
-        .map(|sub| if sub.is_empty() { scene.to_owned() } else { scene.join(sub) })
-        .into_iter()
-        .find(is_model)
+    choose_model(scene).map(|(dir, _)| dir)
+}
+
+/// As [`find_model`], with a sentence for people where there was a choice.
+pub(crate) fn choose_model(scene: &Path) -> Option<(PathBuf, Option<String>)> {
+    let sparse = scene.join("sparse");
+    let only = |dir: PathBuf| is_model(&dir).then_some((dir, None));
+    largest_model(&sparse)
+        .or_else(|| only(sparse))
+        .or_else(|| largest_model(&scene.join("colmap/sparse")))
+        .or_else(|| only(scene.to_owned()))
+}
+
+fn is_model(dir: &Path) -> bool {
+    let files = [BINARY_FILES, TEXT_FILES];
+    files.iter().any(|[cameras, images, _]| dir.join(cameras).exists() || dir.join(images).exists())
+}
+
+/// The numbered model in `sparse` that has registered the most views, the first of equals. Where structure from motion
+/// finds no link between two parts of a capture it leaves a model of each, in no order.
+fn largest_model(sparse: &Path) -> Option<(PathBuf, Option<String>)> {
+    let numbered = |entry: std::fs::DirEntry| Some((entry.file_name().to_str()?.parse::<u32>().ok()?, entry.path()));
+    let mut models: Vec<(u32, PathBuf)> = std::fs::read_dir(sparse).ok()?.flatten().filter_map(numbered).collect();
+    models.retain(|(_, dir)| is_model(dir));
+    models.sort();
+    if models.len() < 2 {
+        return models.pop().map(|(_, dir)| (dir, None));
+    }
+    let counts: Vec<Option<usize>> =
+        models.iter().map(|(_, dir)| read_model(dir).ok().map(|(model, _)| model.images.len())).collect();
+    // The last maximum of the reversed list is the first of equals; a model that cannot be read counts as none.
+    let (chosen, most) = counts.iter().enumerate().rev().max_by_key(|(_, count)| **count)?;
+    let others = models.iter().zip(&counts).enumerate().filter(|(index, _)| *index != chosen);
+    let others = others.map(|(_, ((_, dir), count))| match count {
+        Some(count) => format!("`{}` has {count}", dir.display()),
+        None => format!("`{}` cannot be read", dir.display()),
+    });
+    let others: Vec<String> = others.collect();
+    let dir = models.swap_remove(chosen).1;
+    let said = format!(
+        "the scene has {} models: the largest, `{}` with {} registered views, is used; {}. To use another, give its \
+         directory as the scene",
+        counts.len(),
+        dir.display(),
+        most.unwrap_or(0),
+        others.join(", ")
+    );
+    Some((dir, Some(said)))
 }
 
 /// Reads the model in the directory `dir`: the binary files when both `cameras.bin` and `images.bin` are there, else the
@@ -73,18 +112,23 @@ pub fn read_model(dir: &Path) -> Result<(ColmapModel, SceneFormat)> {
     }
 }
 
-/// The views and points of the scene directory `scene`, whose model is in the directory `model_dir`.
+/// The views and points of the scene directory `scene`, whose model is in the directory `model_dir`; `choice` is what a
+/// person should know about how it was chosen.
 ///
 /// # Errors
 /// As [`read_model`]; [`Error::Format`] when no view is registered, the image directory or any photograph is missing, or
 /// a photograph does not fit its camera.
-pub(crate) fn load_scene(scene: &Path, model_dir: &Path, options: &LoadOptions) -> Result<Scene> {
+pub(crate) fn load_scene(
+    scene: &Path,
+    (model_dir, choice): (&Path, Option<String>),
+    options: &LoadOptions,
+) -> Result<Scene> {
     let (model, source) = read_model(model_dir)?;
     if model.images.is_empty() {
         return Err(Error::format(
             model_dir,
             "the COLMAP model has no registered views",
-            "check the log of `colmap mapper`, or choose another model of the reconstruction (`sparse/1`, …)",
+            "check the log of `colmap mapper`: no photograph could be matched to another",
         ));
     }
     let images_dir = find_images_dir(scene, model_dir, options)?;
@@ -96,7 +140,7 @@ pub(crate) fn load_scene(scene: &Path, model_dir: &Path, options: &LoadOptions) 
     for ((photo, size), image) in photos.into_iter().zip(sizes).zip(&model.images) {
         views.push(builder.view(photo, size, model.cameras[&image.camera_id], &image.camera_from_world)?);
     }
-    let mut warnings = Vec::new();
+    let mut warnings: Vec<String> = choice.into_iter().collect();
     if model.num_dropped_points > 0 {
         warnings.push(format!(
             "{} sparse points with coordinates that are not finite were left out",
@@ -108,8 +152,8 @@ pub(crate) fn load_scene(scene: &Path, model_dir: &Path, options: &LoadOptions) 
 
 fn find_images_dir(scene: &Path, model_dir: &Path, options: &LoadOptions) -> Result<PathBuf> {
     let name = options.images.as_deref().unwrap_or("images");
-    // When the model's own directory was given, the photographs lie beside it or beside `sparse`.
-    let num_parents = if model_dir == scene { 3 } else { 1 };
+    // When the model's own directory was given, the photographs lie beside it, beside `sparse` or beside `colmap`.
+    let num_parents = if model_dir == scene { 4 } else { 1 };
     let bases = || scene.ancestors().take(num_parents);
     if let Some(dir) = bases().map(|base| base.join(name)).find(|dir| dir.is_dir()) {
         return Ok(dir);

@@ -7,7 +7,8 @@ use crate::color::{from_u8, to_u8};
 use crate::error::{Error, Result};
 use crate::image::{RgbImage8, area};
 use crate::view::View;
-use ::image::{DynamicImage, ImageError, ImageFormat, ImageReader, Limits};
+use ::image::metadata::Orientation;
+use ::image::{DynamicImage, ImageDecoder, ImageError, ImageFormat, ImageReader, Limits};
 use std::fs::File;
 use std::io::{BufRead, BufReader, Cursor, ErrorKind, Seek};
 use std::path::Path;
@@ -82,11 +83,12 @@ pub fn image_size(path: impl AsRef<Path>) -> Result<[u32; 2]> {
 /// [`Error::Io`] when the file cannot be read, [`Error::Format`] when it does not decode, [`Error::Unsupported`] for
 /// other image formats.
 pub fn decode_rgb(path: impl AsRef<Path>) -> Result<RgbImage8> {
-    decode(path.as_ref()).map(|decoded| decoded.image)
+    decode(path.as_ref(), |_| true).map(|decoded| decoded.image)
 }
 
 /// The photograph of `view` at the size of its camera: decoded, undistorted at its full size, then reduced by exact
-/// area, its mask with it.
+/// area, its mask with it. It is taken as it is stored, as COLMAP takes it; where only the turn that its EXIF orientation
+/// asks for makes it fit its camera, it is turned.
 ///
 /// # Errors
 /// As [`decode_rgb`], for the photograph and its mask; [`Error::Format`] when their sizes do not fit the view;
@@ -95,27 +97,38 @@ pub fn load_view_image(view: &View) -> Result<TrainingImage> {
     let Some(path) = &view.image_path else {
         return Err(Error::parameter(&view.name, "the view has no photograph, it is a bare camera"));
     };
-    let mut photo = decode(path)?;
+    let pinhole = &view.camera.intrinsics;
+    let fits = |size: [u32; 2]| match &view.distortion {
+        Some(lens) => size == [lens.width, lens.height],
+        None => same_aspect(size, [pinhole.width, pinhole.height]),
+    };
+    let mut photo = decode(path, fits)?;
     let size = [photo.image.width, photo.image.height];
     photo.mask = match &view.mask_path {
         Some(mask_path) => decode_mask(mask_path, size)?,
         None => None,
     };
-    let pinhole = &view.camera.intrinsics;
     if let Some(lens) = &view.distortion {
-        if size != [lens.width, lens.height] {
+        if !fits(size) {
             return Err(size_mismatch(path, size, [lens.width, lens.height]));
         }
         let undistorted = lens.undistort_image(&photo.image, photo.alpha.as_deref(), photo.mask.as_deref());
         photo = TrainingImage { image: undistorted.image, alpha: undistorted.alpha, mask: undistorted.mask };
-    } else if !same_aspect(size, [pinhole.width, pinhole.height]) {
+    } else if !fits(size) {
         return Err(size_mismatch(path, size, [pinhole.width, pinhole.height]));
     }
     Ok(photo.resized(pinhole.width, pinhole.height))
 }
 
-fn decode(path: &Path) -> Result<TrainingImage> {
-    let decoded = decode_any(path)?;
+/// The image, turned as its EXIF orientation says if its size `fits` only then.
+fn decode(path: &Path, fits: impl Fn([u32; 2]) -> bool) -> Result<TrainingImage> {
+    let mut decoded = decode_any(path)?;
+    if !fits([decoded.width(), decoded.height()]) && fits([decoded.height(), decoded.width()]) {
+        let orientation = orientation(path)?;
+        if swaps_sides(orientation) {
+            decoded.apply_orientation(orientation);
+        }
+    }
     let (width, height) = (decoded.width(), decoded.height());
     if !decoded.color().has_alpha() {
         let image = RgbImage8 { width, height, data: decoded.into_rgb8().into_raw() };
@@ -148,6 +161,26 @@ fn decode_mask(path: &Path, size: [u32; 2]) -> Result<Option<Vec<u8>>> {
         .map(|i| if luma[i] == 0 { 0 } else { 255 })
         .collect();
     Ok(mask.contains(&0).then_some(mask))
+}
+
+/// Size \[width, height\] of the image file `path` as its EXIF orientation shows it, if that is another than the stored one.
+///
+/// # Errors
+/// As [`decode_rgb`].
+pub(super) fn turned_size(path: &Path) -> Result<Option<[u32; 2]>> {
+    let [width, height] = image_size(path)?;
+    Ok(swaps_sides(orientation(path)?).then_some([height, width]))
+}
+
+fn orientation(path: &Path) -> Result<Orientation> {
+    let file = File::open(path).map_err(|source| Error::io("read", path, source))?;
+    let mut decoder = reader(path, BufReader::new(file))?.into_decoder().map_err(|error| image_error(path, error))?;
+    decoder.orientation().map_err(|error| image_error(path, error))
+}
+
+fn swaps_sides(orientation: Orientation) -> bool {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    matches!(orientation, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH)
 }
 
 const REPLACE_HINT: &str = "replace the file by an intact JPEG or PNG";

@@ -1,6 +1,6 @@
 //! What both scene formats share: finding the files of a photograph and making its [`View`].
 
-use super::images::image_size;
+use super::images::{image_size, turned_size};
 use crate::camera::distortion::LensDistortion;
 use crate::camera::{Camera, Pinhole};
 use crate::error::{Error, Result};
@@ -105,10 +105,12 @@ impl ViewBuilder {
         Self { max_side, pinholes: HashMap::new() }
     }
 
-    /// The view of `photo`, which has `size` pixels. `lens` may belong to another size of the same photograph.
+    /// The view of `photo`, which is stored with `size` pixels. `lens` may belong to another size of the same photograph,
+    /// and to the photograph as its EXIF orientation shows it: cameras store turned pictures, some programs turn them
+    /// before they calibrate, and the calibration tells.
     ///
     /// # Errors
-    /// [`Error::Format`] when the aspect ratios of photograph and calibration differ.
+    /// [`Error::Format`] when the aspect ratios of photograph and calibration differ either way.
     pub fn view(
         &mut self,
         photo: Photo,
@@ -116,6 +118,11 @@ impl ViewBuilder {
         lens: LensDistortion,
         camera_from_world: &DMat4,
     ) -> Result<View> {
+        let expected = [lens.width, lens.height];
+        let size = match same_aspect(size, expected) {
+            true => size,
+            false => turned_size(&photo.path)?.filter(|turned| same_aspect(*turned, expected)).unwrap_or(size),
+        };
         let [width, height] = size;
         let lens = if size == [lens.width, lens.height] {
             lens

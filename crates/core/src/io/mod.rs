@@ -7,11 +7,16 @@
 pub mod colmap;
 pub mod colmap_bin;
 pub mod colmap_txt;
+mod file_bytes;
 mod image_cache;
 pub mod images;
 mod jpeg;
 mod locate;
+pub mod model;
 pub mod ply;
+mod quantize;
+pub mod splat;
+pub mod spz;
 pub mod transforms;
 mod write;
 

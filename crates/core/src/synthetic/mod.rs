@@ -16,13 +16,14 @@ mod texture;
 pub use bench_cloud::{bench_camera, bench_cloud};
 pub use export::{SynthOptions, write_scene};
 
+use crate::camera::distortion::LensDistortion;
 use crate::camera::{Camera, Pinhole};
 use crate::color::{linear_to_srgb, to_u8};
 use crate::dataset::SparsePoints;
 use crate::image::ImageF32;
 use crate::rng::Rng;
 use geometry::Geometry;
-use glam::{Mat3, Vec2, Vec3};
+use glam::{Mat3, Mat4, Vec2, Vec3};
 use light::{LightMap, RectLight, Surfaces};
 use raycast::{Ray, SurfacePoint};
 use rayon::prelude::*;
@@ -62,6 +63,28 @@ impl SyntheticScene {
     /// number of threads.
     pub fn render(&self, camera: &Camera, samples_per_side: u32) -> ImageF32 {
         let Pinhole { width, height, .. } = camera.intrinsics;
+        self.render_rays([width, height], samples_per_side, |at| Some(pixel_ray(camera, at)))
+    }
+
+    /// As [`render`](Self::render), through a lens that distorts, from a camera posed by `camera_from_world`: what a real
+    /// camera would have taken. Black where no ray comes from.
+    pub fn render_distorted(&self, camera_from_world: Mat4, lens: &LensDistortion, samples_per_side: u32) -> ImageF32 {
+        let intrinsics = Pinhole { width: lens.width, height: lens.height, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0 };
+        // Rays of a camera whose pixels are normalised coordinates.
+        let camera = Camera { intrinsics, camera_from_world };
+        self.render_rays([lens.width, lens.height], samples_per_side, |at| {
+            let distorted = [(f64::from(at.x) - lens.cx) / lens.fx, (f64::from(at.y) - lens.cy) / lens.fy];
+            lens.undistort(distorted).map(|[u, v]| pixel_ray(&camera, Vec2::new(u as f32, v as f32)))
+        })
+    }
+
+    /// The mean of the samples of every pixel; `ray_at` says which ray an image position sees.
+    fn render_rays(
+        &self,
+        [width, height]: [u32; 2],
+        samples_per_side: u32,
+        ray_at: impl Fn(Vec2) -> Option<Ray> + Sync,
+    ) -> ImageF32 {
         let per_side = samples_per_side.max(1);
         let mut data = vec![0.0; 3 * width as usize * height as usize];
         data.par_chunks_mut((3 * width as usize).max(1)).enumerate().for_each(|(y, row)| {
@@ -70,7 +93,7 @@ impl SyntheticScene {
                 for sample in 0..per_side * per_side {
                     let offset = Vec2::new((sample % per_side) as f32 + 0.5, (sample / per_side) as f32 + 0.5);
                     let at = Vec2::new(x as f32, y as f32) + offset / per_side as f32;
-                    sum += tone_mapped(self.radiance(pixel_ray(camera, at)));
+                    sum += ray_at(at).map_or(Vec3::ZERO, |ray| tone_mapped(self.radiance(ray)));
                 }
                 let mean = sum / (per_side * per_side) as f32;
                 pixel.copy_from_slice(&mean.to_array().map(linear_to_srgb));

@@ -273,3 +273,92 @@ fn longer_side_is_limited_and_intrinsics_follow() {
     let pinhole = data.all_views()[0].camera.intrinsics;
     assert_eq!((pinhole.width, pinhole.height, pinhole.fx, pinhole.cy), (12, 8, 10.25, 4.0));
 }
+
+#[test]
+fn of_several_models_the_largest_is_used_aloud() {
+    for base in ["sparse", "colmap/sparse"] {
+        let scene = Scene::new();
+        let whole = small_model(7);
+        let part = |n: usize| ColmapModel { images: whole.images[..n].to_vec(), ..whole.clone() };
+        for (number, model) in [(0, part(2)), (1, part(5)), (2, part(5)), (10, part(3))] {
+            let is_text = number == 1;
+            if is_text {
+                for (name, content) in ["cameras.txt", "images.txt", "points3D.txt"].iter().zip(text(&model)) {
+                    scene.write(&format!("{base}/{number}/{name}"), content);
+                }
+            } else {
+                for (name, content) in ["cameras.bin", "images.bin", "points3D.bin"].iter().zip(binary(&model)) {
+                    scene.write(&format!("{base}/{number}/{name}"), content);
+                }
+            }
+        }
+        scene.write(&format!("{base}/3/images.bin"), "damaged");
+        // Not a number, not a model.
+        for (name, content) in ["cameras.bin", "images.bin"].iter().zip(binary(&whole)) {
+            scene.write(&format!("{base}/aligned/{name}"), content);
+        }
+        std::fs::create_dir_all(scene.at(&format!("{base}/4"))).unwrap();
+        scene.write_photos(&whole);
+        let data = load(&scene).unwrap();
+        assert_eq!((data.all_views().len(), data.source), (5, SceneFormat::ColmapText), "{base}");
+        let [said] = &data.warnings[..] else { panic!("{:?}", data.warnings) };
+        for told in
+            ["has 5 models", "1` with 5 registered views", "0` has 2", "2` has 5", "10` has 3", "3` cannot be read"]
+        {
+            assert!(said.contains(told), "{told}: {said}");
+        }
+        // The hint it gives works.
+        let other = Dataset::load(scene.at(&format!("{base}/10")), &LoadOptions::default());
+        assert_eq!(other.map(|data| (data.all_views().len(), data.warnings)).unwrap(), (3, vec![]));
+    }
+}
+
+#[test]
+fn names_with_blanks_and_of_any_language_are_found() {
+    for is_text in [false, true] {
+        let mut model = small_model(4);
+        for (image, name) in
+            model.images.iter_mut().zip(["zwei Wörter.png", "東京/写真 1.png", "☃ (копия).JPG", "a'b&c.png"])
+        {
+            image.name = name.into();
+        }
+        let scene = if is_text { text_scene(&model) } else { binary_scene(&model) };
+        let mask = gazesplat_core::RgbImage8::filled(32, 20, [0; 3]);
+        gazesplat_core::io::save_png(scene.write("masks/東京/写真 1.png.png", ""), &mask).unwrap();
+        let data = load(&scene).unwrap();
+        let views = data.all_views();
+        let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
+        assert_eq!(names, ["a'b&c.png", "zwei Wörter.png", "☃ (копия).JPG", "東京/写真 1.png"]);
+        for view in views {
+            gazesplat_core::io::images::load_view_image(view).unwrap();
+        }
+        assert!(data.all_views()[3].mask_path.is_some());
+    }
+}
+
+#[test]
+fn calibrations_and_poses_that_cannot_be_are_named() {
+    for (what, file, words) in [
+        ("focal", "cameras.bin", ["camera 1 (PINHOLE)", "focal length fx = 0, expected a positive number of pixels"]),
+        ("center", "cameras.bin", ["camera 1 (PINHOLE)", "expected finite numbers"]),
+        ("size", "cameras.bin", ["camera 1 (PINHOLE)", "image width 0, expected 1 to 65536 pixels"]),
+        ("pose", "images.bin", ["image 100 (`photo 00.JPG`)", "translation [NaN"]),
+    ] {
+        let mut model = small_model(2);
+        let (size, focal, center) = match what {
+            "focal" => ([24, 16], [0.0, 20.25], [12.0, 8.0]),
+            "center" => ([24, 16], [20.5, 20.25], [f64::NAN, 8.0]),
+            "size" => ([0, 16], [20.5, 20.25], [12.0, 8.0]),
+            _ => ([24, 16], [20.5, 20.25], [12.0, 8.0]),
+        };
+        model.cameras.insert(1, gazesplat_core::camera::distortion::LensDistortion::pinhole(size, focal, center));
+        if what == "pose" {
+            model.images[0].camera_from_world.w_axis.x = f64::NAN;
+        }
+        let scene = Scene::new();
+        for (name, content) in ["cameras.bin", "images.bin", "points3D.bin"].iter().zip(binary(&model)) {
+            scene.write(&format!("sparse/0/{name}"), content);
+        }
+        assert_says(&load(&scene).unwrap_err(), file, &words);
+    }
+}

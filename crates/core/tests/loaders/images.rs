@@ -229,3 +229,60 @@ fn pixels_do_not_depend_on_the_number_of_threads() {
     assert!(single.alpha.is_some());
     assert_eq!(single, load(5));
 }
+
+/// A JPEG of `width` × `height` whose left half is red and whose right half is blue, with an EXIF orientation.
+fn tagged_jpeg(scene: &Scene, name: &str, [width, height]: [u32; 2], orientation: u8) -> PathBuf {
+    let color = |x: u32| if x < width / 2 { [250, 0, 0] } else { [0, 0, 250] };
+    let image = image::RgbImage::from_fn(width, height, |x, _| Rgb(color(x)));
+    let path = save(scene, name, image, ImageFormat::Jpeg);
+    let jpeg = std::fs::read(&path).unwrap();
+    // APP1 with one directory of one entry: tag 0x0112, SHORT, count 1.
+    let mut tiff = b"Exif\0\0MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0".to_vec();
+    tiff.extend([orientation, 0, 0, 0, 0, 0, 0]);
+    let mut bytes = jpeg[..2].to_vec();
+    bytes.extend([0xff, 0xe1]);
+    bytes.extend((tiff.len() as u16 + 2).to_be_bytes());
+    bytes.extend(tiff);
+    bytes.extend(&jpeg[2..]);
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+#[test]
+fn orientation_is_followed_where_the_calibration_says_so_and_only_there() {
+    let at = |image: &gazesplat_core::RgbImage8, x: u32, y: u32| {
+        let [r, _, b] = image.pixel(x, y);
+        if r > 150 && b < 100 { 'r' } else { 'b' }
+    };
+    for (orientation, top_left_of_turned) in [(6, 'r'), (8, 'b')] {
+        let mut model = small_model(1);
+        // Reconstructed as stored, as COLMAP does: the tag is passed over.
+        model
+            .cameras
+            .insert(1, gazesplat_core::camera::distortion::LensDistortion::pinhole([48, 32], [40.0; 2], [24.0, 16.0]));
+        let scene = binary_scene(&model);
+        tagged_jpeg(&scene, "images/photo 00.JPG", [48, 32], orientation);
+        let data = Dataset::load(scene.path(), &LoadOptions::default()).unwrap();
+        let stored = load_view_image(data.all_views()[0]).unwrap().image;
+        assert_eq!((stored.width, stored.height, at(&stored, 2, 2), at(&stored, 45, 2)), (48, 32, 'r', 'b'));
+        // Reconstructed as shown: 90° clockwise (6) puts the left half on top, counterclockwise (8) below.
+        let upright = gazesplat_core::camera::distortion::LensDistortion::pinhole([32, 48], [40.0; 2], [16.0, 24.0]);
+        model.cameras.insert(1, upright);
+        let scene = binary_scene(&model);
+        for (size, name) in [([48, 32], "images"), ([24, 16], "images_2")] {
+            tagged_jpeg(&scene, &format!("{name}/photo 00.JPG"), size, orientation);
+            let options = LoadOptions { images: Some(name.into()), ..LoadOptions::default() };
+            let data = Dataset::load(scene.path(), &options).unwrap();
+            let pinhole = data.all_views()[0].camera.intrinsics;
+            let turned = load_view_image(data.all_views()[0]).unwrap().image;
+            assert_eq!([pinhole.width, pinhole.height], [size[1], size[0]]);
+            assert_eq!([turned.width, turned.height], [size[1], size[0]]);
+            assert_eq!(at(&turned, 1, 1), top_left_of_turned, "{orientation} {name}");
+            assert_ne!(at(&turned, 1, size[0] - 2), top_left_of_turned);
+        }
+        // Without a tag there is nothing to follow.
+        tagged_jpeg(&scene, "images/photo 00.JPG", [48, 32], 1);
+        let error = Dataset::load(scene.path(), &LoadOptions::default()).unwrap_err();
+        assert_says(&error, "photo 00.JPG", &["48 × 32 pixels, its camera 32 × 48"]);
+    }
+}

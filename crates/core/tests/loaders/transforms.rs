@@ -81,7 +81,9 @@ fn camera_models_and_coefficients_are_understood() {
         let found = lens(fisheye).unwrap();
         assert_eq!((found.model, found.coefficients[3]), (LensModel::OpenCvFisheye, 0.01));
     }
-    for (name, words) in [("EQUIRECTANGULAR", "EQUIRECTANGULAR"), ("OPENCV", "k4 = 0.5")] {
+    let found = lens(json!({"camera_model": "OPENCV", "k1": 0.1, "k4": 0.01})).unwrap();
+    assert_eq!((found.model, &found.coefficients[..6]), (LensModel::Perspective, &[0.1, 0.0, 0.0, 0.0, 0.0, 0.01][..]));
+    for (name, words) in [("EQUIRECTANGULAR", "EQUIRECTANGULAR"), ("PERSPECTIVE", "PERSPECTIVE")] {
         let content = json!({"camera_model": name, "fl_x": 15.0, "k4": 0.5, "frames": [frame("a.png", 0.0)]});
         let error = load(&scene(&content)).unwrap_err();
         assert!(matches!(error, Error::Unsupported { .. }));
@@ -220,4 +222,19 @@ fn a_colmap_model_is_preferred_and_a_json_file_can_be_given() {
     assert_eq!(load(&scene).unwrap().source, SceneFormat::ColmapBinary);
     let data = Dataset::load(scene.at("transforms.json"), &LoadOptions::default()).unwrap();
     assert_eq!((data.source, data.all_views().len()), (SceneFormat::Transforms, 1));
+}
+
+#[test]
+fn names_with_blanks_and_of_any_language_are_found() {
+    let names = ["images/zwei Wörter.png", "images/東京/写真 1.png", "images\\☃ (копия).png"];
+    let frames: Vec<Value> = names.iter().zip([0.0, 1.0, 2.0]).map(|(name, x)| frame(name, x)).collect();
+    let scene = Scene::new();
+    scene.write("transforms.json", json!({ "fl_x": 20.0, "frames": frames }).to_string());
+    for name in names {
+        scene.write_image(&name.replace('\\', "/"), [20, 10]);
+    }
+    let data = load(&scene).unwrap();
+    assert_eq!(data.warnings, Vec::<String>::new());
+    let found: Vec<String> = data.all_views().iter().map(|view| view.name.clone()).collect();
+    assert_eq!(found, ["zwei Wörter.png", "☃ (копия).png", "東京/写真 1.png"]);
 }

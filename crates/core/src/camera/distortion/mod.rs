@@ -62,7 +62,8 @@ impl LensDistortion {
             | LensModel::SimpleRadial
             | LensModel::Radial
             | LensModel::OpenCv
-            | LensModel::FullOpenCv => self.coefficients != [0.0; 8],
+            | LensModel::FullOpenCv
+            | LensModel::Perspective => self.coefficients != [0.0; 8],
         }
     }
 

@@ -4,7 +4,7 @@
 //! 2001, "Straight lines have to be straight" (FOV); Kannala and Brandt 2006 (fisheye polynomial); Brown 1966
 //! (tangential part). Names and parameter orders are those of COLMAP's `models.h`.
 
-/// A camera model of COLMAP: how a ray becomes a point of the photograph.
+/// A camera model of COLMAP or nerfstudio: how a ray becomes a point of the photograph.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum LensModel {
     /// No distortion, one focal length.
@@ -29,12 +29,14 @@ pub enum LensModel {
     RadialFisheye,
     /// Fisheye with radial, tangential and thin-prism terms.
     ThinPrismFisheye,
+    /// The perspective model of nerfstudio: a polynomial k1 … k4 and a tangential part p1, p2. COLMAP has none such.
+    Perspective,
 }
 
 use LensModel as M;
 
 impl LensModel {
-    /// Every model, in the order of COLMAP's numbers 0 to 10.
+    /// Every model of COLMAP, in the order of its numbers 0 to 10.
     pub const ALL: [Self; 11] = [
         M::SimplePinhole,
         M::Pinhole,
@@ -49,7 +51,7 @@ impl LensModel {
         M::ThinPrismFisheye,
     ];
 
-    /// COLMAP's name, as `cameras.txt` has it.
+    /// COLMAP's name, as `cameras.txt` has it; `PERSPECTIVE` is nobody's.
     pub const fn name(self) -> &'static str {
         match self {
             M::SimplePinhole => "SIMPLE_PINHOLE",
@@ -63,6 +65,7 @@ impl LensModel {
             M::SimpleRadialFisheye => "SIMPLE_RADIAL_FISHEYE",
             M::RadialFisheye => "RADIAL_FISHEYE",
             M::ThinPrismFisheye => "THIN_PRISM_FISHEYE",
+            M::Perspective => "PERSPECTIVE",
         }
     }
 
@@ -86,6 +89,7 @@ impl LensModel {
             M::OpenCvFisheye => &["k1", "k2", "k3", "k4"],
             M::FullOpenCv => &["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"],
             M::Fov => &["omega"],
+            M::Perspective => &["k1", "k2", "p1", "p2", "k3", "k4"],
             M::ThinPrismFisheye => &["k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"],
         }
     }
@@ -121,6 +125,11 @@ pub(super) fn distort(model: LensModel, k: &[f64; 8], [u, v]: [f64; 2]) -> [f64;
             let [du, dv] = tangential(k[2], k[3], [u, v]);
             [u * radial + du, v * radial + dv]
         }
+        M::Perspective => {
+            let [du, dv] = tangential(k[2], k[3], [u, v]);
+            let radial = polynomial(k, r2);
+            [u * radial + du, v * radial + dv]
+        }
         M::Fov => {
             let factor = fov_factor(k[0], r2.sqrt());
             [u * factor, v * factor]
@@ -146,6 +155,7 @@ pub(super) fn distort(model: LensModel, k: &[f64; 8], [u, v]: [f64; 2]) -> [f64;
 pub(super) fn radial_profile(model: LensModel, k: &[f64; 8], r: f64) -> f64 {
     match model {
         M::OpenCv | M::FullOpenCv => r * rational(k, r * r),
+        M::Perspective => r * polynomial(k, r * r),
         M::ThinPrismFisheye => {
             let theta = r.atan();
             theta * fisheye_polynomial([k[0], k[1], k[4], k[5]], theta)
@@ -176,6 +186,11 @@ pub(super) fn max_radius(model: LensModel, k: &[f64; 8]) -> f64 {
 
 fn rational(k: &[f64; 8], r2: f64) -> f64 {
     (1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+}
+
+/// 1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸.
+fn polynomial(k: &[f64; 8], r2: f64) -> f64 {
+    1.0 + r2 * (k[0] + r2 * (k[1] + r2 * (k[4] + r2 * k[5])))
 }
 
 fn tangential(p1: f64, p2: f64, [u, v]: [f64; 2]) -> [f64; 2] {

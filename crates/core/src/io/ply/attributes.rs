@@ -22,13 +22,6 @@ pub(super) struct Attributes {
 impl Attributes {
     /// Finds the columns of a 3DGS model, or says which are missing.
     pub fn of_gaussians(path: &Path, header: &Header) -> Result<Self> {
-        if header.column("packed_position").is_some() {
-            return Err(Error::unsupported(
-                path,
-                "this is a compressed PLY (packed_position, packed_rotation, …); models are read as plain 3DGS PLY files",
-                "convert it to a plain PLY first, for example with `splat-transform`",
-            ));
-        }
         let mut missing = Vec::new();
         let mut find = |name: String| {
             header.column(&name).unwrap_or_else(|| {

@@ -63,9 +63,9 @@ pub(super) fn read(
     Ok((cloud, unusable.concat()))
 }
 
-/// Writes header and rows of `cloud` in the 3DGS order.
-pub(super) fn write(file: &mut impl Write, cloud: &GaussianCloud) -> std::io::Result<()> {
-    file.write_all(header_text(cloud.len(), cloud.sh_degree).as_bytes())?;
+/// Writes header and rows of `cloud` in the 3DGS order, with `comments` in the header.
+pub(super) fn write(file: &mut impl Write, cloud: &GaussianCloud, comments: &[String]) -> std::io::Result<()> {
+    file.write_all(header_text(cloud.len(), cloud.sh_degree, comments).as_bytes())?;
     let n = cloud.len();
     let mut ready = gathered(cloud, 0, n.min(ROWS_PER_BLOCK));
     let mut next_row = n.min(ROWS_PER_BLOCK);
@@ -86,8 +86,9 @@ pub(super) fn write(file: &mut impl Write, cloud: &GaussianCloud) -> std::io::Re
 }
 
 /// The PLY header of `num_gaussians` rows of SH `degree`, in the order of the 3DGS reference implementation.
-pub(super) fn header_text(num_gaussians: usize, degree: u32) -> String {
-    let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {num_gaussians}\n");
+pub(super) fn header_text(num_gaussians: usize, degree: u32, comments: &[String]) -> String {
+    let mut text = start_of_header(comments);
+    text.push_str(&format!("element vertex {num_gaussians}\n"));
     let mut property = |name: &str| text.push_str(&format!("property float {name}\n"));
     ["x", "y", "z", "nx", "ny", "nz"].into_iter().for_each(&mut property);
     (0..3).for_each(|i| property(&format!("f_dc_{i}")));
@@ -96,6 +97,18 @@ pub(super) fn header_text(num_gaussians: usize, degree: u32) -> String {
     (0..3).for_each(|i| property(&format!("scale_{i}")));
     (0..4).for_each(|i| property(&format!("rot_{i}")));
     text.push_str("end_header\n");
+    text
+}
+
+/// The lines before the first element.
+pub(super) fn start_of_header(comments: &[String]) -> String {
+    let mut text = "ply\nformat binary_little_endian 1.0\n".to_owned();
+    for comment in comments {
+        let printable = |c: char| if c.is_ascii_graphic() || c == ' ' { c } else { '?' };
+        // Readers that search for the end of the header instead of parsing it must not find it here.
+        let line = comment.chars().map(printable).collect::<String>().replace("end_header", "end header");
+        text.push_str(&format!("comment {}\n", line.trim()));
+    }
     text
 }
 

@@ -16,6 +16,10 @@ pub(super) struct Header {
     pub before: Vec<ElementDef>,
     /// The vertices.
     pub vertex: ElementDef,
+    /// Elements stored after the vertices.
+    pub after: Vec<ElementDef>,
+    /// Comment lines, without the word `comment`.
+    pub comments: Vec<String>,
     /// Offset of the first byte after the header.
     pub data_offset: usize,
 }
@@ -49,9 +53,9 @@ impl Header {
                 "a model or point cloud is stored as `vertex` elements",
             ));
         };
-        elements.truncate(position + 1);
+        let after = elements.split_off(position + 1);
         let vertex = elements.pop().expect("`position` is an index of `elements`");
-        Ok(Self { encoding, before: elements, vertex, data_offset })
+        Ok(Self { encoding, before: elements, vertex, after, comments: comments(&text), data_offset })
     }
 
     /// Index of the scalar property `name` in a vertex row.
@@ -75,6 +79,10 @@ impl Header {
             "the file was not written or copied completely: copy or export it again",
         )
     }
+}
+
+fn comments(text: &str) -> Vec<String> {
+    text.lines().filter_map(|line| line.strip_prefix("comment ")).map(|line| line.trim().to_owned()).collect()
 }
 
 /// Names joined by commas, for messages.
@@ -129,8 +137,10 @@ fn not_a_ply(path: &Path, bytes: &[u8]) -> Error {
     };
     Error::unsupported(
         path,
-        format!("this is {other}; models are read as 3DGS PLY files"),
-        "convert it to a plain 3DGS PLY first",
+        format!(
+            "this is {other}, expected a PLY file; models are read from PLY, compressed PLY, `.splat` and SPZ files"
+        ),
+        "convert it to one of them first",
     )
 }
 

@@ -6,24 +6,26 @@
 //!
 //! Files whose vertices are all-float little-endian rows, in any property order, are scattered in parallel straight from
 //! a memory map; anything else (ASCII, big endian, other types, lists, elements before the vertices) goes through
-//! `ply-rs-bw` row by row.
+//! `ply-rs-bw` row by row. SuperSplat's packed layout is recognised by its properties; how exact it is says the
+//! table at the top of `compressed.rs`.
 
 mod attributes;
+mod compressed;
 mod fallback;
 mod fast;
 mod header;
 mod points;
 
+pub(super) use compressed::MAX_DEGREE as MAX_COMPRESSED_DEGREE;
+pub use compressed::save_compressed;
 pub use points::load_points;
 
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::gaussian_cloud::GaussianCloud;
+use crate::io::file_bytes::FileBytes;
 use attributes::Attributes;
 use header::Header;
-use memmap2::Mmap;
-use std::fs::File;
-use std::io::{Read, Write};
-use std::ops::Deref;
+use std::io::Write;
 use std::path::Path;
 
 /// What [`load_with_report`] found in the file besides the model.
@@ -50,31 +52,65 @@ pub fn load(path: impl AsRef<Path>) -> Result<GaussianCloud> {
 ///
 /// # Errors
 ///
-/// - [`Error::Io`] when the file cannot be read.
-/// - [`Error::Format`] when it is no PLY, its header is malformed, attributes are missing (all of them are named), the
+/// - [`crate::Error::Io`] when the file cannot be read.
+/// - [`crate::Error::Format`] when it is no PLY, its header is malformed, attributes are missing (all of them are named), the
 ///   number of `f_rest` properties fits no degree, or rows are missing at the end.
-/// - [`Error::Unsupported`] for compressed PLY and other formats of splats, which are recognised by their first bytes.
+/// - [`crate::Error::Unsupported`] for other formats of splats, which are recognised by their first bytes;
+///   [`crate::io::model::load_with_report`] reads some of them.
 pub fn load_with_report(path: impl AsRef<Path>) -> Result<(GaussianCloud, PlyReport)> {
     let path = path.as_ref();
     let bytes = FileBytes::open(path)?;
-    let header = Header::parse(path, &bytes)?;
-    let attributes = Attributes::of_gaussians(path, &header)?;
-    let (cloud, unusable) = if header.is_all_float_little_endian() {
-        fast::read(path, &bytes, &header, &attributes)?
+    let PlyContent { cloud, report, .. } = read(path, &bytes)?;
+    Ok((cloud, report))
+}
+
+/// A model with what its file says about it.
+pub(super) struct PlyContent {
+    pub cloud: GaussianCloud,
+    pub report: PlyReport,
+    /// Whether the file has the packed layout of SuperSplat.
+    pub is_compressed: bool,
+    /// Comment lines of the header, without the word `comment`.
+    pub comments: Vec<String>,
+}
+
+/// Reads the model in `bytes`, the content of `path`, as [`load_with_report`] does.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<PlyContent> {
+    let header = Header::parse(path, bytes)?;
+    let is_compressed = header.column("packed_position").is_some();
+    let (cloud, unusable) = if is_compressed {
+        compressed::read(path, bytes, &header)?
     } else {
-        fallback::read_gaussians(path, &bytes, &header, &attributes)?
+        let attributes = Attributes::of_gaussians(path, &header)?;
+        if header.is_all_float_little_endian() {
+            fast::read(path, bytes, &header, &attributes)?
+        } else {
+            fallback::read_gaussians(path, bytes, &header, &attributes)?
+        }
     };
-    Ok(without_unusable(cloud, &unusable))
+    let (cloud, report) = without_unusable(cloud, &unusable);
+    Ok(PlyContent { cloud, report, is_compressed, comments: header.comments })
 }
 
 /// Writes `cloud` in the 3DGS layout, binary little endian, normals zero. The file appears complete or not at all.
 ///
 /// # Errors
 ///
-/// [`Error::Parameter`] when the vectors of `cloud` differ in their number of rows, [`Error::Io`] when writing fails.
+/// [`crate::Error::Parameter`] when the vectors of `cloud` differ in their number of rows, [`crate::Error::Io`] when writing fails.
 pub fn save(path: impl AsRef<Path>, cloud: &GaussianCloud) -> Result<()> {
+    save_with_comments(path, cloud, &[])
+}
+
+/// Writes `cloud` as [`save`] does, with `comments` in the header: one line each, which other programs pass over.
+/// Characters outside printable ASCII become `?`: readers in circulation count the characters of the header instead of
+/// its bytes.
+///
+/// # Errors
+///
+/// As [`save`].
+pub fn save_with_comments(path: impl AsRef<Path>, cloud: &GaussianCloud, comments: &[String]) -> Result<()> {
     cloud.validate_shape()?;
-    crate::io::write_atomically(path.as_ref(), |file| fast::write(file, cloud))
+    crate::io::write_atomically(path.as_ref(), |file| fast::write(file, cloud, comments))
 }
 
 /// Writes `cloud` as [`save`] does, to any writer.
@@ -84,17 +120,18 @@ pub fn save(path: impl AsRef<Path>, cloud: &GaussianCloud) -> Result<()> {
 /// `InvalidInput` when the vectors of `cloud` differ in their number of rows; what the writer returns.
 pub fn write_to(out: &mut impl Write, cloud: &GaussianCloud) -> std::io::Result<()> {
     cloud.validate_shape().map_err(|e| std::io::Error::new(std::io::ErrorKind::InvalidInput, e))?;
-    fast::write(out, cloud)
+    fast::write(out, cloud, &[])
 }
 
 /// A row that cannot be drawn, found while reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct UnusableRow {
+pub(in crate::io) struct UnusableRow {
     index: usize,
     is_finite: bool,
 }
 
-fn without_unusable(cloud: GaussianCloud, unusable: &[UnusableRow]) -> (GaussianCloud, PlyReport) {
+/// Leaves the `unusable` rows out and counts them.
+pub(in crate::io) fn without_unusable(cloud: GaussianCloud, unusable: &[UnusableRow]) -> (GaussianCloud, PlyReport) {
     let num_rows = cloud.len();
     let num_dropped_zero_quat = unusable.iter().filter(|row| row.is_finite).count();
     let num_dropped_non_finite = unusable.len() - num_dropped_zero_quat;
@@ -108,39 +145,17 @@ fn without_unusable(cloud: GaussianCloud, unusable: &[UnusableRow]) -> (Gaussian
     (cloud.select(&kept), report)
 }
 
-/// The content of a file: mapped when it is a regular file, read otherwise (pipes).
-enum FileBytes {
-    Mapped(Mmap),
-    Read(Vec<u8>),
-}
-
-impl FileBytes {
-    fn open(path: &Path) -> Result<Self> {
-        let io = |source| Error::io("read", path, source);
-        let mut file = File::open(path).map_err(io)?;
-        let metadata = file.metadata().map_err(io)?;
-        if metadata.is_dir() {
-            return Err(io(std::io::ErrorKind::IsADirectory.into()));
-        }
-        if metadata.is_file() && metadata.len() > 0 {
-            // SAFETY: the map is read-only and dropped before `load*` returns. Another process that truncates the file
-            // meanwhile can end this one with a bus error, as with every mapped reader; copying the file first would
-            // halve the measured throughput.
-            return unsafe { Mmap::map(&file) }.map(Self::Mapped).map_err(io);
-        }
-        let mut bytes = Vec::new();
-        file.read_to_end(&mut bytes).map_err(io)?;
-        Ok(Self::Read(bytes))
+impl UnusableRow {
+    /// The rows of `cloud` that cannot be drawn, in order.
+    pub(in crate::io) fn all_of(cloud: &GaussianCloud) -> Vec<Self> {
+        let bad = |&index: &usize| !cloud.is_row_valid(index);
+        // Of the two faults a zero quaternion is the one that leaves all values finite.
+        (0..cloud.len()).filter(bad).map(|index| Self { index, is_finite: has_zero_quat_only(cloud, index) }).collect()
     }
 }
 
-impl Deref for FileBytes {
-    type Target = [u8];
-
-    fn deref(&self) -> &[u8] {
-        match self {
-            Self::Mapped(map) => map,
-            Self::Read(bytes) => bytes,
-        }
-    }
+fn has_zero_quat_only(cloud: &GaussianCloud, index: usize) -> bool {
+    let mut row = cloud.select(&[index]);
+    row.quats[0] = [1.0, 0.0, 0.0, 0.0];
+    row.is_row_valid(0)
 }

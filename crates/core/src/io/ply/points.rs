@@ -1,11 +1,11 @@
 //! Sparse points: `x y z` with or without colours, the usual initialisation of a training run.
 
-use super::FileBytes;
 use super::fallback::for_each_row;
 use super::header::Header;
 use crate::color::to_u8;
 use crate::dataset::SparsePoints;
 use crate::error::{Error, Result};
+use crate::io::file_bytes::FileBytes;
 use crate::sh;
 use ply_rs_bw::ply::{PropertyType, ScalarType};
 use std::path::Path;

@@ -114,7 +114,7 @@ impl Focal {
     }
 }
 
-/// Lens model and coefficients. As nerfstudio does, perspective models use whichever of k1, k2, k3, p1, p2 are given,
+/// Lens model and coefficients. As nerfstudio does, perspective models use whichever of k1 … k4, p1, p2 are given,
 /// whatever the name says.
 fn lens_model(frame: &Map<String, Value>, globals: &Map<String, Value>) -> Result<(LensModel, [f64; 8]), Problem> {
     let value = |key: &str| frame.get(key).or_else(|| globals.get(key)).filter(|value| !value.is_null());
@@ -145,24 +145,23 @@ fn lens_model(frame: &Map<String, Value>, globals: &Map<String, Value>) -> Resul
             | LensModel::Radial
             | LensModel::OpenCv,
         ) => {
-            if k4 != 0.0 {
-                let message =
-                    format!("k4 = {k4} of the camera model {name} is not supported; k1, k2, k3, p1 and p2 are");
-                return Err(Problem::Model(message));
-            }
-            let model = if k3 != 0.0 {
+            let model = if k4 != 0.0 {
+                LensModel::Perspective
+            } else if k3 != 0.0 {
                 LensModel::FullOpenCv
             } else if [k1, k2, p1, p2] != [0.0; 4] {
                 LensModel::OpenCv
             } else {
                 LensModel::Pinhole
             };
-            Ok((model, [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]))
+            Ok((model, [k1, k2, p1, p2, k3, k4, 0.0, 0.0]))
         }
-        Some(LensModel::Fov | LensModel::ThinPrismFisheye) | None => Err(Problem::Model(format!(
-            "the camera model {name} is not supported in transforms files; supported are SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, \
+        Some(LensModel::Fov | LensModel::ThinPrismFisheye | LensModel::Perspective) | None => {
+            Err(Problem::Model(format!(
+                "the camera model {name} is not supported in transforms files; supported are SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, \
              RADIAL, OPENCV, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE and OPENCV_FISHEYE"
-        ))),
+            )))
+        }
     }
 }
 

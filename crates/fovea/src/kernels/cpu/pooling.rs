@@ -126,6 +126,14 @@ impl<T: Real> Bilinear<T> {
         (i, (i + 1).min(self.num_values - 1), self.weight[s])
     }
 
+    /// As [`Bilinear::source`] of the places from `s` on.
+    #[inline(always)]
+    pub fn sources(&self, s: usize) -> impl Iterator<Item = (usize, usize, T)> {
+        let last = self.num_values - 1;
+        let pairs = self.first[s..].iter().zip(&self.weight[s..]);
+        pairs.map(move |(i, w)| (*i as usize, (*i as usize + 1).min(last), *w))
+    }
+
     /// Places whose first value is in `values`.
     #[inline(always)]
     pub fn places(&self, values: Range<usize>) -> Range<usize> {

@@ -11,7 +11,7 @@ use super::compare::compare_statistics;
 use super::{BAND_ROWS, Context, Distance, Tally};
 use crate::hvs::pooling::GazePooling;
 use crate::kernels::cpu::pooling::{AreaMean, Bilinear};
-use crate::kernels::cpu::pyramid::{Kernel, Plane, correlate_row};
+use crate::kernels::cpu::pyramid::{Kernel, Plane, block, correlate_row, in_blocks};
 use crate::real::{Real, Task, add_scaled, dispatch, fma};
 use rayon::prelude::*;
 use std::ops::{Range, RangeInclusive};
@@ -318,7 +318,7 @@ impl<T: Real> Compare<'_, T> {
         let mut mixed: Vec<Vec<Sample<T>>> = level.mips.iter().map(|m| vec![[T::ZERO; 4]; m.width]).collect();
         let mut v_mixed: Vec<Vec<VSample<T>>> = level.mips.iter().map(|m| vec![[T::ZERO; 2]; m.width]).collect();
         let mut v_band = if context.gradient { level.reached(rows.clone()) } else { Vec::new() };
-        let mut pooled = vec![[T::ZERO; 4]; width];
+        let (mut pooled, mut second) = (vec![[T::ZERO; 4]; width], vec![[T::ZERO; 4]; width]);
         let mut distances = vec![T::ZERO; width];
         let mut v_row = vec![[T::ZERO; 2]; width];
         for y in rows {
@@ -332,33 +332,35 @@ impl<T: Real> Compare<'_, T> {
                     Some(k) => mix_rows::<T, FMA>(&level.mips[k + 1], &chain[k], y, &mut mixed[k + 1]),
                 }
             }
-            let lods = level.first[y * width..][..width].iter().zip(&level.weight[y * width..][..width]);
-            for (x, (pooled, (first, weight))) in pooled.iter_mut().zip(lods.clone()).enumerate() {
-                let k = usize::from(*first);
-                *pooled = sampled::<T, FMA>(&level.mips[k], &mixed[k], x);
-                if *weight != T::ZERO {
-                    let second = sampled::<T, FMA>(&level.mips[k + 1], &mixed[k + 1], x);
-                    for q in 0..4 {
-                        pooled[q] = fma::<T, FMA>(*weight, second[q] - pooled[q], pooled[q]);
+            let (first, weights) = (&level.first[y * width..][..width], &level.weight[y * width..][..width]);
+            for run in runs(first) {
+                let k = usize::from(first[run.start]);
+                let out = &mut pooled[run.clone()];
+                enlarge::<T, FMA>(&level.mips[k], &mixed[k], run.start, out);
+                if let Some(mip) = level.mips.get(k + 1) {
+                    let second = &mut second[..run.len()];
+                    enlarge::<T, FMA>(mip, &mixed[k + 1], run.start, second);
+                    for ((v, s), w) in out.iter_mut().zip(second).zip(&weights[run]) {
+                        for q in 0..4 {
+                            v[q] = fma::<T, FMA>(*w, s[q] - v[q], v[q]);
+                        }
                     }
                 }
             }
-            for ((p, d), v) in pooled.iter().zip(&mut distances).zip(&mut v_row) {
-                let [mean, square, other_mean, other_square] = *p;
-                (*d, v[0], v[1]) =
-                    compare_statistics::<T, L1>((mean, square), (other_mean, other_square), context.scale);
-            }
+            compare_row::<T, L1>(&pooled, context.scale, &mut distances, &mut v_row);
             context.add(&mut tally, y, y - first_row, &distances);
             if !context.gradient {
                 continue;
             }
             context.restrict(y, &mut v_row);
-            for (x, (v, (first, weight))) in v_row.iter().zip(lods).enumerate() {
-                let k = usize::from(*first);
-                spread::<T, FMA>(&level.mips[k], T::ONE - *weight, *v, x, &mut v_mixed[k]);
-                if *weight != T::ZERO {
-                    spread::<T, FMA>(&level.mips[k + 1], *weight, *v, x, &mut v_mixed[k + 1]);
+            for run in runs(first) {
+                let k = usize::from(first[run.start]);
+                let (x, v, weights) = (run.start, &v_row[run.clone()], &weights[run]);
+                if let Some(mip) = level.mips.get(k + 1) {
+                    spread::<T, FMA>(mip, x, v.iter().zip(weights).map(|(v, w)| (*v, *w)), &mut v_mixed[k + 1]);
                 }
+                let rest = v.iter().zip(weights).map(|(v, w)| (*v, T::ONE - *w));
+                spread::<T, FMA>(&level.mips[k], x, rest, &mut v_mixed[k]);
             }
             for k in level.used[y].clone() {
                 let (mip, v_mixed) = (&level.mips[k], &mut v_mixed[k]);
@@ -400,29 +402,81 @@ fn mix_rows<T: Real, const FMA: bool>(mip: &Mip<T>, samples: &[Sample<T>], y: us
     }
 }
 
-/// A row of a mip, enlarged along rows, at pixel `x`.
-#[inline(always)]
-fn sampled<T: Real, const FMA: bool>(mip: &Mip<T>, row: &[Sample<T>], x: usize) -> Sample<T> {
-    let (left, right, across) = mip.up_columns.source(x);
-    let (a, b) = (&row[left], &row[right]);
-    let mut out = [T::ZERO; 4];
-    for q in 0..4 {
-        out[q] = fma::<T, FMA>(across, b[q] - a[q], a[q]);
-    }
-    out
+/// Ranges of pixels of a row that have their first mip in common.
+fn runs(first: &[u8]) -> impl Iterator<Item = Range<usize>> {
+    let mut end = 0;
+    first.chunk_by(|a, b| a == b).map(move |run| {
+        end += run.len();
+        end - run.len()..end
+    })
 }
 
-/// The adjoint of [`sampled`] for the first image: adds `weight` times `v`, the gradient at pixel `x`.
+/// A row of a mip, enlarged along rows, at the pixels from `x` on.
 #[inline(always)]
-fn spread<T: Real, const FMA: bool>(mip: &Mip<T>, weight: T, v: VSample<T>, x: usize, v_row: &mut [VSample<T>]) {
-    let (left, right, across) = mip.up_columns.source(x);
-    let (by_left, by_right) = (weight * (T::ONE - across), weight * across);
-    for q in 0..2 {
-        v_row[left][q] = fma::<T, FMA>(by_left, v[q], v_row[left][q]);
+fn enlarge<T: Real, const FMA: bool>(mip: &Mip<T>, row: &[Sample<T>], x: usize, out: &mut [Sample<T>]) {
+    for (v, (left, right, across)) in out.iter_mut().zip(mip.up_columns.sources(x)) {
+        let (a, b) = (&row[left], &row[right]);
+        for q in 0..4 {
+            v[q] = fma::<T, FMA>(across, b[q] - a[q], a[q]);
+        }
     }
-    for q in 0..2 {
-        v_row[right][q] = fma::<T, FMA>(by_right, v[q], v_row[right][q]);
+}
+
+/// The adjoint of [`enlarge`] for the first image: adds the gradients at the pixels from `x` on, each times a weight.
+/// Pixels between the same two values add up in registers: in memory each would wait for the one before.
+#[inline(always)]
+fn spread<T: Real, const FMA: bool>(
+    mip: &Mip<T>,
+    x: usize,
+    v_pixels: impl Iterator<Item = (VSample<T>, T)>,
+    v_row: &mut [VSample<T>],
+) {
+    let add = |v: &mut VSample<T>, sum: VSample<T>| *v = [v[0] + sum[0], v[1] + sum[1]];
+    let mut current = mip.up_columns.first(x);
+    let (mut by_left, mut by_right) = ([T::ZERO; 2], [T::ZERO; 2]);
+    for ((v, weight), (left, _, across)) in v_pixels.zip(mip.up_columns.sources(x)) {
+        if left != current {
+            add(&mut v_row[current], by_left);
+            if left == current + 1 {
+                by_left = by_right;
+            } else {
+                add(&mut v_row[current + 1], by_right);
+                by_left = [T::ZERO; 2];
+            }
+            by_right = [T::ZERO; 2];
+            current = left;
+        }
+        let (w_left, w_right) = (weight * (T::ONE - across), weight * across);
+        for q in 0..2 {
+            by_left[q] = fma::<T, FMA>(w_left, v[q], by_left[q]);
+        }
+        for q in 0..2 {
+            by_right[q] = fma::<T, FMA>(w_right, v[q], by_right[q]);
+        }
     }
+    add(&mut v_row[current], by_left);
+    // Behind the last value there is none, and no pixel weighs it.
+    if let Some(v) = v_row.get_mut(current + 1) {
+        add(v, by_right);
+    }
+}
+
+/// Distances of a row of pools and, in `v_row`, the gradients by mean and mean square of the first image.
+#[inline(always)]
+fn compare_row<T: Real, const L1: bool>(pooled: &[Sample<T>], scale: T, distances: &mut [T], v_row: &mut [VSample<T>]) {
+    in_blocks!(distances.len(), |x0, B, _C| {
+        let pooled = block::<Sample<T>, B>(pooled, x0);
+        let (mut d, mut v) = ([T::ZERO; B], [[T::ZERO; 2]; B]);
+        for x in 0..B {
+            let [mean, square, other_mean, other_square] = pooled[x];
+            let (distance, v_mean, v_square) =
+                compare_statistics::<T, L1>((mean, square), (other_mean, other_square), scale);
+            d[x] = distance;
+            v[x] = [v_mean, v_square];
+        }
+        distances[x0..x0 + B].copy_from_slice(&d);
+        v_row[x0..x0 + B].copy_from_slice(&v);
+    });
 }
 
 /// Gradients by row `i` of mip `k`: what the bands that reach it have, and what the next coarser mip passes on.

@@ -336,10 +336,10 @@ impl<T: Real> Compare<'_, T> {
             for run in runs(first) {
                 let k = usize::from(first[run.start]);
                 let out = &mut pooled[run.clone()];
-                enlarge::<T, FMA>(&level.mips[k], &mixed[k], run.start, out);
+                level.mips[k].up_columns.enlarge_quads::<FMA>(&mixed[k], run.start, out);
                 if let Some(mip) = level.mips.get(k + 1) {
                     let second = &mut second[..run.len()];
-                    enlarge::<T, FMA>(mip, &mixed[k + 1], run.start, second);
+                    mip.up_columns.enlarge_quads::<FMA>(&mixed[k + 1], run.start, second);
                     for ((v, s), w) in out.iter_mut().zip(second).zip(&weights[run]) {
                         for q in 0..4 {
                             v[q] = fma::<T, FMA>(*w, s[q] - v[q], v[q]);
@@ -411,18 +411,7 @@ fn runs(first: &[u8]) -> impl Iterator<Item = Range<usize>> {
     })
 }
 
-/// A row of a mip, enlarged along rows, at the pixels from `x` on.
-#[inline(always)]
-fn enlarge<T: Real, const FMA: bool>(mip: &Mip<T>, row: &[Sample<T>], x: usize, out: &mut [Sample<T>]) {
-    for (v, (left, right, across)) in out.iter_mut().zip(mip.up_columns.sources(x)) {
-        let (a, b) = (&row[left], &row[right]);
-        for q in 0..4 {
-            v[q] = fma::<T, FMA>(across, b[q] - a[q], a[q]);
-        }
-    }
-}
-
-/// The adjoint of [`enlarge`] for the first image: adds the gradients at the pixels from `x` on, each times a weight.
+/// The adjoint of [`Bilinear::enlarge_quads`] for the first image: adds the gradients at the pixels from `x` on, each times a weight.
 /// Pixels between the same two values add up in registers: in memory each would wait for the one before.
 #[inline(always)]
 fn spread<T: Real, const FMA: bool>(

@@ -63,7 +63,7 @@ pub(crate) enum Statistics {
         high: CubeTensor,
         /// By level, by group of bands.
         bands: Vec<Vec<CubeTensor>>,
-        residual: Planes,
+        residual: Box<Planes>,
     },
 }
 
@@ -175,7 +175,7 @@ impl Plan {
             bands.push(self.filters.bands.iter().map(of_group).collect::<Result<_>>()?);
         }
         let high = statistics::of(gpu, &correlate(gpu, &planes, &self.filters.high)?, &pools[0])?;
-        Ok(Statistics::Uniform { high, bands, residual: levels[LEVELS - 1].clone() })
+        Ok(Statistics::Uniform { high, bands, residual: Box::new(levels[LEVELS - 1].clone()) })
     }
 
     /// Low-passes of all levels.

@@ -6,6 +6,8 @@
 //! stored enlarged: of a row of pixels, the mips it uses are enlarged along columns, and its pixels look up two values of
 //! each. Jobs are bands of rows of pixels, which keep the gradients by the mips that they reach for themselves; these are
 //! added in the order of the bands.
+//!
+//! Above 400 lines: what builds a chain, what samples it and the adjoints share its layout and are read together.
 
 use super::compare::compare_statistics;
 use super::{BAND_ROWS, Context, Distance, Tally};

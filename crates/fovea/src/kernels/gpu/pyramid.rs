@@ -9,6 +9,8 @@
 //! and write nothing. NaN spreads as arithmetic spreads it. No plane is empty.
 
 mod resize;
+#[cfg(test)]
+mod tests;
 
 pub(crate) use resize::Resize;
 

@@ -99,11 +99,12 @@ impl HvsqTerm {
             TermDistance::Mse => Distance::Mse,
         };
         let hvsq = Hvsq::new(Pooling::Uniform { size_px: self.pooling_px }, distance)?;
+        let device = trainer.splats().means.device();
         for view in trainer.images().views() {
             let pinhole = view.camera.intrinsics;
-            hvsq.check_size((pinhole.width as usize, pinhole.height as usize)).map_err(|error| {
+            hvsq.check_size_on((pinhole.width as usize, pinhole.height as usize), &device).map_err(|error| {
                 Failure::new(format!("`{HVSQ_LOSS}.pooling_px` and the photograph `{}`: {error}", view.name))
-                    .hint("choose smaller pools, or larger images with `data.max_side`")
+                    .hint("choose other pools, or another size of the images with `data.max_side`")
             })?;
         }
         let cache = Arc::new(ReferenceCache::new(hvsq, self.cache_mb.saturating_mul(1 << 20)));

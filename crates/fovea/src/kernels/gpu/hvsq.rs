@@ -23,7 +23,7 @@ use crate::hvs::pyramid::{BAND_LEVELS, FilterBank, LEVELS};
 use crate::kernels::cpu::hvsq::{Distance, enlarged};
 use crate::kernels::cpu::pooling::Pools as HostPools;
 use crate::kernels::gpu::pooling::Pools;
-use crate::kernels::gpu::pyramid::{Filters, Planes, Resize, correlate, halve};
+use crate::kernels::gpu::pyramid::{Filters, GROUP, Planes, Resize, correlate, halve};
 use crate::kernels::gpu::{NUM_UNITS, reduced};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
@@ -121,6 +121,21 @@ impl Tally {
         self.num_sums += num_units.div_ceil(NUM_UNITS);
         first as u32
     }
+}
+
+/// Checks that an adapter takes the largest buffer of a comparison of images of `size`: the chain of mips of one filter, or
+/// the responses of a group of filters and the gradients along their rows of cells.
+///
+/// # Errors
+/// [`gazesplat_render::Error::Limit`].
+pub(crate) fn check_size(gpu: &Gpu, size: (usize, usize), pooling: &Pooling) -> Result<()> {
+    let (width, height) = enlarged(size);
+    let rows = match pooling {
+        // Four values per sample, and mips take less than half of what they are made of.
+        Pooling::Gaze(_) => 3 * 4 * height * 3 / 2,
+        Pooling::Uniform { size_px } => 3 * GROUP * height.max(2 * (height as f64 / size_px) as usize),
+    };
+    gpu.check_size("bytes of responses of a pyramid", &[rows, width], DType::F32)
 }
 
 impl Plan {

@@ -6,6 +6,7 @@ use gazesplat_core::View;
 use gazesplat_fovea::Hvsq;
 use gazesplat_fovea::hvs::pooling::Pooling;
 use gazesplat_fovea::hvsq::{Distance, HvsqLoss, HvsqMetric, ReferenceCache};
+use gazesplat_render::device::Device;
 use gazesplat_train::Trainer;
 use gazesplat_train::losses::ImageLoss;
 use gazesplat_train::metrics::{Bound, Guard};
@@ -92,16 +93,17 @@ impl HvsqTerm {
     /// # Errors
     /// When the pools are larger than a photograph.
     pub fn register(&self, trainer: &mut Trainer) -> Result<Option<Arc<ReferenceCache>>> {
-        let Some((loss, cache)) = self.make(trainer.images().views())? else { return Ok(None) };
+        let device = trainer.splats().means.device();
+        let Some((loss, cache)) = self.make(trainer.images().views(), &device)? else { return Ok(None) };
         trainer.add_loss(self.weight, loss);
         Ok(Some(cache))
     }
 
-    /// The term for the photographs of `views`, if it has a weight, and the cache that its statistics are kept in.
+    /// The term for the photographs of `views` on `device`, if it has a weight, and the cache that its statistics are kept in.
     ///
     /// # Errors
     /// When the pools are larger than a photograph.
-    pub fn make(&self, views: &[View]) -> Result<Option<(Box<dyn ImageLoss>, Arc<ReferenceCache>)>> {
+    pub fn make(&self, views: &[View], device: &Device) -> Result<Option<(Box<dyn ImageLoss>, Arc<ReferenceCache>)>> {
         if !self.is_used() {
             return Ok(None);
         }
@@ -113,9 +115,9 @@ impl HvsqTerm {
         let hvsq = Hvsq::new(Pooling::Uniform { size_px: self.pooling_px }, distance)?;
         for view in views {
             let pinhole = view.camera.intrinsics;
-            hvsq.check_size((pinhole.width as usize, pinhole.height as usize)).map_err(|error| {
+            hvsq.check_size_on((pinhole.width as usize, pinhole.height as usize), device).map_err(|error| {
                 Failure::new(format!("`{HVSQ_LOSS}.pooling_px` and the photograph `{}`: {error}", view.name))
-                    .hint("choose smaller pools, or larger images with `data.max_side`")
+                    .hint("choose other pools, or another size of the images with `data.max_side`")
             })?;
         }
         let cache = Arc::new(ReferenceCache::new(hvsq, self.cache_mb.saturating_mul(1 << 20)));

@@ -182,7 +182,7 @@ impl<'a> Run<'a> {
             let name = format!("{}-pruned", scene_name(&args.scene));
             (pruner, PruneDir::create(args.out.as_deref(), &name, args.overwrite)?)
         };
-        let pruner = with_terms(pruner, &config, &terms, &stage)?;
+        let pruner = with_terms(pruner, &config, &terms, &stage, device.tensors())?;
         let run = Self {
             model,
             config,

@@ -143,6 +143,21 @@ impl Hvsq {
         }
     }
 
+    /// Checks that images of this size (width, height) can be compared on `device`.
+    ///
+    /// # Errors
+    /// As [`Hvsq::check_size`]; [`Error::Render`] when a GPU takes no buffer as large as a comparison needs.
+    pub fn check_size_on(&self, size: (usize, usize), device: &Device) -> Result<()> {
+        self.check_size(size)?;
+        #[cfg(feature = "gpu")]
+        if let Some(gpu) = gazesplat_render::gpu::Gpu::from_device(device) {
+            crate::kernels::gpu::hvsq::check_size(&gpu, size, &self.pooling)?;
+        }
+        #[cfg(not(feature = "gpu"))]
+        let _ = device;
+        Ok(())
+    }
+
     /// The statistics of an image that others will be compared with.
     ///
     /// # Errors
@@ -166,7 +181,7 @@ impl Hvsq {
         if let Some(gpu) = gazesplat_render::gpu::Gpu::from_device(device) {
             check_image(&image)?;
             let size = (image.width, image.height);
-            self.check_size(size)?;
+            self.check_size_on(size, device)?;
             return Ok(self.held(size, Held::Device(Box::new(device::DeviceReference::new(&gpu, self, image)?))));
         }
         #[cfg(not(feature = "gpu"))]

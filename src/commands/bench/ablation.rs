@@ -91,7 +91,7 @@ fn study(args: &AblationArgs, device: &ComputeDevice, console: &Console) -> Resu
     let run = |config: &PruneConfig| -> Result<(GaussianCloud, bool)> {
         let recorded_terms = serde_json::to_value(&terms).expect("settings are plain data");
         let pruner = Pruner::new(&stage.job(&model, config, &recorded_terms, device.tensors()))?;
-        let mut pruner = with_terms(pruner, config, &terms, &stage)?;
+        let mut pruner = with_terms(pruner, config, &terms, &stage, device.tensors())?;
         let plan = *pruner.plan();
         let mut bar = TrainProgress::new(console, plan.reference + plan.num_steps());
         loop {

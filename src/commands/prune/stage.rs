@@ -99,13 +99,19 @@ impl Stage {
 }
 
 /// `pruner` with the terms of the loss and the bounds that crate `train` knows nothing of.
-pub(crate) fn with_terms(pruner: Pruner, config: &PruneConfig, terms: &PruneTerms, stage: &Stage) -> Result<Pruner> {
+pub(crate) fn with_terms(
+    pruner: Pruner,
+    config: &PruneConfig,
+    terms: &PruneTerms,
+    stage: &Stage,
+    device: &Device,
+) -> Result<Pruner> {
     let (loss, bound) = (config.guard.loss, terms.guard.hvsq.clone());
     bound.add_to(Guard::default())?;
     let mut pruner = pruner.with_guard(Box::new(move |reference, basis| {
         bound.add_to(basis.guard(reference, loss)).expect("its settings have been checked")
     }));
-    if let Some((loss, _)) = terms.loss.hvsq.make(&stage.split.gradient)? {
+    if let Some((loss, _)) = terms.loss.hvsq.make(&stage.split.gradient, device)? {
         pruner.add_loss(terms.loss.hvsq.weight, loss);
     }
     Ok(pruner)

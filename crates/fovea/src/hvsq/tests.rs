@@ -164,6 +164,19 @@ fn gpu_equals_cpu_by_region() {
     }
 }
 
+/// An image whose responses no adapter takes is refused by their bytes, before anything is allocated.
+#[test]
+fn images_too_large_for_the_adapter_are_refused() {
+    let Some(gpu) = gpu() else { return };
+    for pooling in [uniform(3.0), Pooling::Gaze(GazePooling::default())] {
+        let hvsq = Hvsq::new(pooling, Distance::L1).unwrap();
+        assert_eq!(hvsq.check_size_on((960, 540), &gpu), Ok(()));
+        let refused = hvsq.check_size_on((1 << 16, 1 << 16), &gpu);
+        assert!(matches!(refused, Err(Error::Render(gazesplat_render::Error::Limit { .. }))), "{refused:?}");
+        assert_eq!(hvsq.check_size_on((1 << 16, 1 << 16), &gazesplat_render::cpu_device()), Ok(()));
+    }
+}
+
 /// Equal images; two runs; NaN in either image.
 #[test]
 fn gpu_gives_zero_the_same_bits_and_nan() {

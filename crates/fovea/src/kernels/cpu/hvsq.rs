@@ -295,6 +295,7 @@ impl<T: Real> Plan<T> {
             wanted,
             sums: vec![vec![0.0; num_values]; LEVELS],
             maps: (0..LEVELS).map(|l| self.plane_size(l)).map(|(w, h)| vec![T::ZERO; w * h]).collect(),
+            scratch: gaze::Scratch::default(),
         };
         if !wanted.map {
             sweep.maps.clear();

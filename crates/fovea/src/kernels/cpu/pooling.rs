@@ -126,6 +126,14 @@ impl<T: Real> Bilinear<T> {
         (i, (i + 1).min(self.num_values - 1), self.weight[s])
     }
 
+    /// As [`Bilinear::source`] of the places from `s` on.
+    #[inline(always)]
+    pub fn sources(&self, s: usize) -> impl Iterator<Item = (usize, usize, T)> {
+        let last = self.num_values - 1;
+        let pairs = self.first[s..].iter().zip(&self.weight[s..]);
+        pairs.map(move |(i, w)| (*i as usize, (*i as usize + 1).min(last), *w))
+    }
+
     /// Places whose first value is in `values`.
     #[inline(always)]
     pub fn places(&self, values: Range<usize>) -> Range<usize> {
@@ -150,18 +158,23 @@ impl<T: Real> Bilinear<T> {
         }
     }
 
-    /// All places of two rows of pairs, one beside the other: the four numbers share what is looked up.
+    /// All places of two rows of pairs, one beside the other: the four numbers share what is looked up. `quads` is scratch
+    /// of the values' length: laid together there, four numbers are one load.
     #[inline(always)]
-    pub fn enlarge_pairs<const FMA: bool>(&self, values: [&[[T; 2]]; 2], out: &mut [[T; 4]]) {
-        let last = self.num_values - 1;
-        for ((v, i), w) in out.iter_mut().zip(&self.first).zip(&self.weight) {
-            let i = *i as usize;
-            let next = (i + 1).min(last);
-            let [[a0, a1], [b0, b1]] = [values[0][i], values[0][next]];
-            let [[c0, c1], [d0, d1]] = [values[1][i], values[1][next]];
-            let (from, to) = ([a0, a1, c0, c1], [b0, b1, d0, d1]);
+    pub fn enlarge_pairs<const FMA: bool>(&self, values: [&[[T; 2]]; 2], quads: &mut [[T; 4]], out: &mut [[T; 4]]) {
+        for ((quad, a), b) in quads.iter_mut().zip(values[0]).zip(values[1]) {
+            *quad = [a[0], a[1], b[0], b[1]];
+        }
+        self.enlarge_quads::<FMA>(quads, 0, out);
+    }
+
+    /// Places from `s` on, as many as `out` takes, of a row of four numbers each.
+    #[inline(always)]
+    pub fn enlarge_quads<const FMA: bool>(&self, quads: &[[T; 4]], s: usize, out: &mut [[T; 4]]) {
+        for (v, (left, right, weight)) in out.iter_mut().zip(self.sources(s)) {
+            let (from, to) = (&quads[left], &quads[right]);
             for q in 0..4 {
-                v[q] = fma::<T, FMA>(*w, to[q] - from[q], from[q]);
+                v[q] = fma::<T, FMA>(weight, to[q] - from[q], from[q]);
             }
         }
     }
@@ -290,7 +303,7 @@ mod tests {
                 }
                 let cell_pairs: Vec<[f64; 2]> = cells.iter().map(|v| [*v, 2.0 * v]).collect();
                 let mut quads = vec![[0.0; 4]; n];
-                up.enlarge_pairs::<false>([&cell_pairs, &cell_pairs], &mut quads);
+                up.enlarge_pairs::<false>([&cell_pairs, &cell_pairs], &mut vec![[0.0; 4]; m], &mut quads);
                 assert!(quads.iter().zip(&enlarged).all(|(q, v)| *q == [*v, 2.0 * v, *v, 2.0 * v]));
                 let (a, b) = (dot(&enlarged, &samples), dot(&cells, &gathered));
                 assert!((a - b).abs() < 1e-12, "bilinear {n} {m}: {a} {b}");

@@ -6,7 +6,7 @@
 
 mod resize;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 
 pub use resize::ImageView;
 pub(crate) use resize::Resize;

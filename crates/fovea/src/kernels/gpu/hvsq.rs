@@ -23,7 +23,7 @@ use crate::hvs::pyramid::{BAND_LEVELS, FilterBank, LEVELS};
 use crate::kernels::cpu::hvsq::{Distance, enlarged};
 use crate::kernels::cpu::pooling::Pools as HostPools;
 use crate::kernels::gpu::pooling::Pools;
-use crate::kernels::gpu::pyramid::{Filters, Planes, Resize, correlate, halve};
+use crate::kernels::gpu::pyramid::{Filters, GROUP, Planes, Resize, correlate, halve};
 use crate::kernels::gpu::{NUM_UNITS, reduced};
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
@@ -63,7 +63,7 @@ pub(crate) enum Statistics {
         high: CubeTensor,
         /// By level, by group of bands.
         bands: Vec<Vec<CubeTensor>>,
-        residual: Planes,
+        residual: Box<Planes>,
     },
 }
 
@@ -123,6 +123,21 @@ impl Tally {
     }
 }
 
+/// Checks that an adapter takes the largest buffer of a comparison of images of `size`: the chain of mips of one filter, or
+/// the responses of a group of filters and the gradients along their rows of cells.
+///
+/// # Errors
+/// [`gazesplat_render::Error::Limit`].
+pub(crate) fn check_size(gpu: &Gpu, size: (usize, usize), pooling: &Pooling) -> Result<()> {
+    let (width, height) = enlarged(size);
+    let rows = match pooling {
+        // Four values per sample, and mips take less than half of what they are made of.
+        Pooling::Gaze(_) => 3 * 4 * height * 3 / 2,
+        Pooling::Uniform { size_px } => 3 * GROUP * height.max(2 * (height as f64 / size_px) as usize),
+    };
+    gpu.check_size("bytes of responses of a pyramid", &[rows, width], DType::F32)
+}
+
 impl Plan {
     /// As [`crate::kernels::cpu::hvsq::Plan::new`], on an adapter.
     pub fn new(gpu: &Gpu, size: (usize, usize), bank: &FilterBank, pooling: &Pooling, distance: Distance) -> Self {
@@ -175,7 +190,7 @@ impl Plan {
             bands.push(self.filters.bands.iter().map(of_group).collect::<Result<_>>()?);
         }
         let high = statistics::of(gpu, &correlate(gpu, &planes, &self.filters.high)?, &pools[0])?;
-        Ok(Statistics::Uniform { high, bands, residual: levels[LEVELS - 1].clone() })
+        Ok(Statistics::Uniform { high, bands, residual: Box::new(levels[LEVELS - 1].clone()) })
     }
 
     /// Low-passes of all levels.

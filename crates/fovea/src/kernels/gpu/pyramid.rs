@@ -9,6 +9,8 @@
 //! and write nothing. NaN spreads as arithmetic spreads it. No plane is empty.
 
 mod resize;
+#[cfg(test)]
+mod tests;
 
 pub(crate) use resize::Resize;
 
@@ -355,7 +357,7 @@ struct Mirror {
 /// Place `which` of three that take the value at `i` of `n`: itself, beyond the first end, beyond the last.
 #[cube]
 fn mirror(which: usize, i: usize, n: usize) -> Mirror {
-    let is_first = which == 1 && i >= 1 && i <= RADIUS;
+    let is_first = which == 1 && i != 0 && i <= RADIUS;
     let is_last = which == 2 && i + RADIUS + 1 >= n && i + 2 <= n;
     let place = select(is_first, 4 - select(is_first, i, 0usize), select(is_last, 2 * (n - 1) + 4 - i, i + 4));
     Mirror { exists: which == 0 || is_first || is_last, place }

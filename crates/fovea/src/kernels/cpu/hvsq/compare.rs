@@ -69,6 +69,7 @@ impl<T: Real> Compare<'_, T> {
         let mut tally = context.tally(own.len(), width);
         // Enlarged rows of cells i at i mod 2: mean and mean square of the first image, then of the second.
         let mut enlarged = vec![[T::ZERO; 4]; 2 * width];
+        let mut cells = vec![[T::ZERO; 4]; columns];
         let mut v_rows = vec![[T::ZERO; 2]; 2 * width];
         let mut distances = vec![T::ZERO; width];
         let mut v_pixels = vec![[T::ZERO; 2]; width];
@@ -85,7 +86,7 @@ impl<T: Real> Compare<'_, T> {
                         let found = found[start..][..2 * columns].as_chunks().0;
                         let reference = reference[start..][..2 * columns].as_chunks().0;
                         let out = &mut enlarged[i % 2 * width..][..width];
-                        pools.x.up.enlarge_pairs::<FMA>([found, reference], out);
+                        pools.x.up.enlarge_pairs::<FMA>([found, reference], &mut cells, out);
                     }
                 }
                 let rows_of = [&enlarged[upper % 2 * width..][..width], &enlarged[lower % 2 * width..][..width]];

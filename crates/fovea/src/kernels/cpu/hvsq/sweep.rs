@@ -1,7 +1,7 @@
 //! The sweep over the levels of one channel, from the residual up: sums of distances, the distance of every pixel, and the
 //! gradient by the channel. Every map is dropped before the next is made.
 
-use super::gaze::GazeLevel;
+use super::gaze::{self, GazeLevel};
 use super::gradient::{self, Source};
 use super::{ChannelStatistics, Context, Distance, Plan, Tally, Wanted, compare, distance_of, groups, statistics};
 use crate::hvs::pyramid::LEVELS;
@@ -17,6 +17,8 @@ pub(super) struct Sweep<'a, T> {
     pub sums: Vec<Vec<f64>>,
     /// By level, over channels and maps; empty when not wanted.
     pub maps: Vec<Vec<T>>,
+    /// Of the gaze-dependent form.
+    pub scratch: gaze::Scratch<T>,
 }
 
 impl<T: Real> Sweep<'_, T> {
@@ -217,11 +219,13 @@ impl<T: Real> Sweep<'_, T> {
         kernel: &Kernel<T>,
         v_plane: &mut [T],
     ) {
+        let mut scratch = std::mem::take(&mut self.scratch);
         let context = self.context(l);
-        let (tallies, v_responses) = pools.compare(planes, kernel, &context);
+        let (tallies, v_responses) = pools.compare(planes, kernel, &context, &mut scratch);
         if context.gradient {
-            gradient::add(planes[0], &[*kernel], false, Source::Rows(&v_responses), &context, v_plane);
+            gradient::add(planes[0], &[*kernel], false, Source::Rows(v_responses), &context, v_plane);
         }
+        self.scratch = scratch;
         self.add(l, tallies);
     }
 

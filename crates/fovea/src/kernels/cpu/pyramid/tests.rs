@@ -118,3 +118,58 @@ fn adjoint_of_halving_colour_and_resizing() {
         assert!((forward - backward).abs() < 1e-11 * (1.0 + forward.abs()), "{from:?}: {forward} {backward}");
     }
 }
+
+/// Checks the map `key` of formula image a, three channels of `width` × `height`, against the record, to 1e-6 (hvsq.md
+/// §12, test 2).
+pub(crate) fn assert_golden_map(key: &str, values: &[f32], (width, height): (usize, usize)) {
+    let json = gazesplat_testkit::golden::find("hvsq_formula").expect("shipped").load_json();
+    let expected = &json["pyramid"][key];
+    assert_eq!(expected["shape"], serde_json::json!([3, height, width]), "{key}");
+    let sum = |f: fn(f64) -> f64| values.iter().map(|v| f(f64::from(*v))).sum::<f64>() / values.len() as f64;
+    let sample = values[3.min(height - 1) * width + 4.min(width - 1)];
+    for (name, found) in [("mean", sum(|v| v)), ("rms", sum(|v| v * v).sqrt()), ("c0_3_4", f64::from(sample))] {
+        let expected = expected[name].as_f64().expect("a number");
+        assert!((found - expected).abs() < 1e-6, "{key} {name}: {found} instead of {expected}");
+    }
+}
+
+/// Formula image a.
+pub(crate) fn golden_image() -> Vec<f32> {
+    use gazesplat_testkit::reference::hvsq::images::{interleaved, pair};
+    interleaved(&pair(96, 160)[0], 3)
+}
+
+#[test]
+fn golden_maps_of_the_pyramid() {
+    let data = golden_image();
+    let filters = Filters::<f32>::new(&FilterBank::sp5());
+    let image = ImageView { width: 160, height: 96, channels: 3, data: &data };
+    let planes = Resize::new((160, 96), (160, 96)).planes(&image);
+    let filtered = |planes: &[Plane<f32>], kernel: &Kernel<f32>| -> Vec<f32> {
+        let rows = planes.iter().flat_map(|plane| (0..plane.height).map(move |y| (plane, y)));
+        let row = |(plane, y): (&Plane<f32>, usize)| {
+            let mut row = vec![0.0; plane.width];
+            correlate_row::<f32, false, 1>(plane, y, &[*kernel], false, &mut row);
+            row
+        };
+        rows.flat_map(row).collect()
+    };
+    assert_golden_map("L0.h0", &filtered(&planes, &filters.high), (160, 96));
+    let mut low: Vec<Plane<f32>> = planes
+        .iter()
+        .map(|p| {
+            let values = filtered(std::slice::from_ref(p), &filters.low);
+            let mut low = Plane::zeros(160, 96);
+            low.fill_rows(|y, row| row.copy_from_slice(&values[y * 160..][..160]));
+            low
+        })
+        .collect();
+    for l in 0..4 {
+        for (o, kernel) in filters.bands.iter().enumerate() {
+            assert_golden_map(&format!("L{l}.b{o}"), &filtered(&low, kernel), (160 >> l, 96 >> l));
+        }
+        low = low.iter().map(halve).collect();
+    }
+    let residual: Vec<f32> = low.iter().flat_map(|p| (0..6).flat_map(|y| p.row(y).to_vec())).collect();
+    assert_golden_map("L4.l0", &residual, (10, 6));
+}

@@ -5,6 +5,8 @@
 //! the one before, down to one sample, one behind the other in one buffer: a pixel samples any two of it. Mips are never
 //! stored enlarged. A unit computes one sample, one pixel, or one gradient; gradients by a mip are gathered along columns
 //! of pixels first, then along rows.
+//!
+//! Above 400 lines: what builds a chain, what samples it and the adjoints share its layout and are read together.
 
 use super::super::pooling::{
     cell_end, cell_start, end_cell, first_cell, inverse_count, up_source_at, up_start, up_weight,

@@ -195,6 +195,11 @@ impl TerminationLut {
         self.largest_limit
     }
 
+    /// The smallest of [`TerminationLut::limits`].
+    pub fn smallest_limit(&self) -> f32 {
+        self.limits.iter().copied().fold(f32::INFINITY, f32::min)
+    }
+
     /// For each cell the largest limit of the cells that are up to [`TerminationLut::ahead`] farther along every axis: what
     /// a colour of the cell can ever be compared with, `[size³]`.
     pub fn limits_ahead(&self) -> &[f32] {

@@ -9,7 +9,7 @@
 //! at for rows only in which some pixel has come within reach of its largest entry.
 
 use super::bin::TileLists;
-use super::lut::{TileLut, below_limit, residual, tile_lut};
+use super::lut::{Line, TileLut, below_limit, needs_fixed, residual, tile_lut};
 use super::stats::{PairStats, StatsLevel};
 use super::tile::{BATCH, CENTERS, RasterSplat, Row, RowI, Staged, TileRect, raster_splats, stage};
 use crate::layout::{TILE, lane};
@@ -110,21 +110,25 @@ pub fn rasterize(
         .zip(tile_stats.par_iter_mut())
         .map(|(((((tile_y, image), final_t), stop), tile_ends), pair_stats)| {
             let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats };
-            if options.lut.is_some() {
-                return match (level, options.depth) {
-                    (StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, true>(strip)),
-                    (StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, true>(strip)),
-                    (StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, true>(strip)),
-                    (StatsLevel::None, true) => dispatch(ForwardStrip::<true, 0, false, true>(strip)),
+            if let Some(lut) = &options.lut {
+                return match (needs_fixed(lut, options.t_stop), level, options.depth) {
+                    (false, StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, LUT_ALONE>(strip)),
+                    (false, StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, LUT_ALONE>(strip)),
+                    (false, StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, LUT_ALONE>(strip)),
+                    (false, StatsLevel::None, true) => dispatch(ForwardStrip::<true, 0, false, LUT_ALONE>(strip)),
+                    (true, StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, LUT_AND_FIXED>(strip)),
+                    (true, StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, LUT_AND_FIXED>(strip)),
+                    (true, StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, LUT_AND_FIXED>(strip)),
+                    (true, StatsLevel::None, true) => dispatch(ForwardStrip::<true, 0, false, LUT_AND_FIXED>(strip)),
                 };
             }
             match (level, options.depth, options.smooth_cutoff) {
-                (StatsLevel::Dominance, ..) => dispatch(ForwardStrip::<false, 1, false, false>(strip)),
-                (StatsLevel::All, ..) => dispatch(ForwardStrip::<false, 2, false, false>(strip)),
-                (StatsLevel::None, false, false) => dispatch(ForwardStrip::<false, 0, false, false>(strip)),
-                (StatsLevel::None, true, false) => dispatch(ForwardStrip::<true, 0, false, false>(strip)),
-                (StatsLevel::None, false, true) => dispatch(ForwardStrip::<false, 0, true, false>(strip)),
-                (StatsLevel::None, true, true) => dispatch(ForwardStrip::<true, 0, true, false>(strip)),
+                (StatsLevel::Dominance, ..) => dispatch(ForwardStrip::<false, 1, false, NO_LUT>(strip)),
+                (StatsLevel::All, ..) => dispatch(ForwardStrip::<false, 2, false, NO_LUT>(strip)),
+                (StatsLevel::None, false, false) => dispatch(ForwardStrip::<false, 0, false, NO_LUT>(strip)),
+                (StatsLevel::None, true, false) => dispatch(ForwardStrip::<true, 0, false, NO_LUT>(strip)),
+                (StatsLevel::None, false, true) => dispatch(ForwardStrip::<false, 0, true, NO_LUT>(strip)),
+                (StatsLevel::None, true, true) => dispatch(ForwardStrip::<true, 0, true, NO_LUT>(strip)),
             }
         })
         .collect::<Vec<RenderStats>>();
@@ -166,11 +170,18 @@ struct Strip<'a> {
     pair_stats: &'a mut Vec<PairStats>,
 }
 
-/// The forward kernel. `STATS`: 0 = image, 1 = dominance counters, 2 = all counters; counters replace the image. `LUT`:
-/// with a termination table.
-struct ForwardStrip<'a, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool>(Strip<'a>);
+/// Without a termination table.
+const NO_LUT: u8 = 0;
+/// With a termination table beside the fixed rule.
+const LUT_AND_FIXED: u8 = 1;
+/// With a termination table and nothing else: one comparison less, and a stop is looked for where the table was asked.
+const LUT_ALONE: u8 = 2;
 
-impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Kernel
+/// The forward kernel. `STATS`: 0 = image, 1 = dominance counters, 2 = all counters; counters replace the image. `LUT`:
+/// [`NO_LUT`], [`LUT_AND_FIXED`] or [`LUT_ALONE`].
+struct ForwardStrip<'a, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8>(Strip<'a>);
+
+impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kernel
     for ForwardStrip<'_, DEPTH, STATS, SMOOTH, LUT>
 {
     type Output = RenderStats;
@@ -259,14 +270,14 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
 
 /// Blends one splat into the rows it reaches. Returns the number of rows visited.
 #[inline(always)]
-fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool>(
+fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8>(
     s: S,
     g: &Staged,
     index: i32,
     rows: &mut [PixelRow; TILE],
     options: &RasterOptions,
     lut: TileLut<'_>,
-    lines: &mut [Row; TILE],
+    lines: &mut [Line; TILE],
     counters: Option<&mut PairStats>,
 ) -> usize {
     let (first, end) = (g.first_row as usize, (g.end_row as usize).min(TILE));
@@ -298,18 +309,31 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
         let t = s.load(&row.t.0);
         let t_next = s.fnma(alpha, t, t);
         // Kerbl 2023, App. C: stop before the splat that would end the pixel.
-        let mut blended = s.gt_where(hit, t_next, t_stop);
-        if LUT {
-            blended = s.and_not(blended, below_limit(s, lut, hit, t, &row.channels, &mut lines[y]));
-            y += 1;
+        let (blended, now);
+        if LUT == LUT_ALONE {
+            let alive = s.gt_where(hit, t, zero);
+            now = below_limit(s, lut, alive, t, &row.channels, &mut lines[y]);
+            blended = s.and_not(alive, now);
+        } else {
+            let mut ahead = s.gt_where(hit, t_next, t_stop);
+            if LUT == LUT_AND_FIXED {
+                let alive = s.gt_where(hit, t, zero);
+                ahead = s.and_not(ahead, below_limit(s, lut, alive, t, &row.channels, &mut lines[y]));
+            }
+            blended = ahead;
+            now = s.gt_where(s.and_not(hit, blended), t, zero);
         }
+        y += 1;
         let weight = s.mul_where(blended, alpha, t);
-        // No branch: in a dense tile some pixel stops at almost every splat.
-        let now = s.gt_where(s.and_not(hit, blended), t, zero);
         let t_new = s.select(blended, t_next, t);
-        s.store(s.select(now, s.neg_abs(t), t_new), &mut row.t.0);
-        s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
-        if STATS == 0 || LUT {
+        // Else no branch: under the fixed rule some pixel of a dense tile stops at almost every splat.
+        if LUT == LUT_ALONE && s.bits(now) == 0 {
+            s.store(t_new, &mut row.t.0);
+        } else {
+            s.store(s.select(now, s.neg_abs(t), t_new), &mut row.t.0);
+            s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
+        }
+        if STATS == 0 || LUT != NO_LUT {
             let num = if DEPTH { 4 } else { 3 };
             for (sum, channel) in row.channels[..num].iter_mut().zip(channels) {
                 s.store(s.fma(weight, channel, s.load(&sum.0)), &mut sum.0);
@@ -367,7 +391,7 @@ fn last_stop(rows: &[PixelRow; TILE], tile: &TileRect) -> usize {
 
 /// Writes a tile's pixels: colour over the background, 1 − T, and depth.
 #[inline(always)]
-fn write_colors<S: Simd, const DEPTH: bool, const LUT: bool>(
+fn write_colors<S: Simd, const DEPTH: bool, const LUT: u8>(
     s: S,
     rows: &[PixelRow; TILE],
     tile: &TileRect,
@@ -385,7 +409,7 @@ fn write_colors<S: Simd, const DEPTH: bool, const LUT: bool>(
         for ((plane, channel), b) in planes.iter_mut().zip(&row.channels).zip(background) {
             let color = s.load(&channel.0);
             let mut rest = b;
-            if LUT {
+            if LUT != NO_LUT {
                 rest = s.select(s.gt(signed, s.splat(0.0)), b, residual(s, lut, t, color, b));
             }
             s.store(s.fma(t, rest, color), plane);

@@ -7,7 +7,7 @@
 //! | `point_cloud.ply` | the model, 3DGS layout |
 //! | `eval.json` | test-view quality |
 //! | `report.html` | all of it to look at |
-//! | `unfinished.ply` | only of a training that failed: its last good model |
+//! | `unfinished.ply` | only of a training that failed, or is under way on a GPU: its last good model |
 
 use crate::diagnostics::{Failure, Result};
 use crate::settings;
@@ -99,7 +99,7 @@ impl RunDir {
         self.path.join("eval.json")
     }
 
-    /// `unfinished.ply`: the last good model of a training that failed.
+    /// `unfinished.ply`: the last good model of a training that failed or is under way.
     pub fn unfinished_path(&self) -> PathBuf {
         self.path.join("unfinished.ply")
     }
@@ -116,13 +116,7 @@ impl RunDir {
     pub fn clear(&self) -> Result<()> {
         let unfinished = self.unfinished_path();
         let files = [self.model_path(), self.eval_path(), self.report_path(), self.metrics_path(), unfinished];
-        for file in files.into_iter().chain([self.settings_path()]) {
-            match fs::remove_file(&file) {
-                Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(cannot_write(&file, e)),
-                _ => {}
-            }
-        }
-        Ok(())
+        files.into_iter().chain([self.settings_path()]).try_for_each(|file| remove(&file))
     }
 
     /// Writes `settings.toml`: the resolved settings under lines that say where they come from, and on which device the
@@ -146,6 +140,22 @@ impl RunDir {
     /// When the file cannot be written.
     pub fn write_model(&self, cloud: &GaussianCloud) -> Result<()> {
         Ok(gazesplat_core::io::ply::save(self.model_path(), cloud)?)
+    }
+
+    /// Writes `unfinished.ply`.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub(crate) fn write_unfinished(&self, cloud: &GaussianCloud) -> Result<()> {
+        Ok(gazesplat_core::io::ply::save(self.unfinished_path(), cloud)?)
+    }
+
+    /// Removes `unfinished.ply`, when the model itself is there.
+    ///
+    /// # Errors
+    /// When it cannot be removed.
+    pub(crate) fn remove_unfinished(&self) -> Result<()> {
+        remove(&self.unfinished_path())
     }
 
     /// Writes `eval.json`.
@@ -187,6 +197,14 @@ impl Drop for RunDir {
 }
 
 const MODEL: &str = "point_cloud.ply";
+
+/// Removes a file that may not be there.
+fn remove(file: &Path) -> Result<()> {
+    match fs::remove_file(file) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(cannot_write(file, e)),
+        _ => Ok(()),
+    }
+}
 
 /// The growing `metrics.jsonl`. The one file that is appended to: whole lines, flushed, so that it can be followed.
 #[derive(Debug)]

@@ -75,6 +75,14 @@ fn core_knows_no_tensors_and_libraries_no_command_line() {
     }
 }
 
+/// Public functions of kernels on the CPU that are no passes, with their files.
+const CPU_ONLY: [(&str, &str); 2] = [
+    // The boundary of one splat; on a GPU it is read together with its place.
+    ("bin", "contour"),
+    // One tensor of a model; on a GPU one kernel updates all.
+    ("adam", "update"),
+];
+
 /// The files of kernels in `dir`, by pass.
 fn passes(dir: &Path) -> BTreeMap<String, String> {
     let mut passes = BTreeMap::new();
@@ -99,24 +107,17 @@ fn every_kernel_has_a_twin_on_the_other_processor() {
     for entry in fs::read_dir(root().join("crates")).expect("readable") {
         let kernels = entry.expect("readable").path().join("src/kernels");
         let [cpu, gpu] = ["cpu", "gpu"].map(|processor| passes(&kernels.join(processor)));
-        if !kernels.join("cpu").is_dir() || !kernels.join("gpu").is_dir() {
+        if !kernels.is_dir() {
             continue;
         }
+        assert!(kernels.join("cpu").is_dir() && kernels.join("gpu").is_dir(), "{}: one side only", kernels.display());
         let names = |passes: &BTreeMap<String, String>| passes.keys().cloned().collect::<Vec<_>>();
         assert_eq!(names(&cpu), names(&gpu), "{}: files of one side only", kernels.display());
         for (pass, text) in &cpu {
             let (on_cpu, on_gpu) = (public_functions(text), public_functions(&gpu[pass]));
-            let entry = pass.as_str();
-            assert!(
-                !on_cpu.contains(entry) || on_gpu.contains(entry),
-                "{}: kernels/gpu/{pass}.rs has no `pub fn {entry}`, kernels/cpu/{pass}.rs has",
-                kernels.display()
-            );
-            assert!(
-                on_cpu.is_empty() || !on_cpu.is_disjoint(&on_gpu),
-                "{}: {pass}.rs has none of its entries {on_cpu:?} on the GPU, where it has {on_gpu:?}",
-                kernels.display()
-            );
+            let missing: Vec<&&str> =
+                on_cpu.difference(&on_gpu).filter(|name| !CPU_ONLY.contains(&(pass.as_str(), **name))).collect();
+            assert!(missing.is_empty(), "{}: kernels/gpu/{pass}.rs lacks {missing:?}", kernels.display());
             num_pairs += 1;
         }
     }

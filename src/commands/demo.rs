@@ -60,7 +60,7 @@ pub struct DemoArgs {
 /// When the device cannot be used, or the directory cannot be written.
 pub fn command(args: &DemoArgs, console: &Console) -> Result<()> {
     let device = ComputeDevice::open(args.device.device, console)?;
-    device.guard(|| demo(args, &device, console))
+    demo(args, &device, console)
 }
 
 fn demo(args: &DemoArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
@@ -86,7 +86,7 @@ fn demo(args: &DemoArgs, device: &ComputeDevice, console: &Console) -> Result<()
 
     console.note("3/3  an orbit through the model");
     let orbit_started = Instant::now();
-    let (orbit, film) = write_orbit(&args.out, &trained, &job, size.num_frames, console)?;
+    let (orbit, film) = device.guard(|| write_orbit(&args.out, &trained, &job, size.num_frames, console))?;
     let orbit_secs = orbit_started.elapsed().as_secs_f64();
 
     let report = &mut trained.report;

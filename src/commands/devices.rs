@@ -1,18 +1,18 @@
 //! `gazesplat info --devices`: what `--device` can name on this machine, and what the program would make of it.
 
-use super::vector_instructions;
+use super::{device, vector_instructions};
 use crate::console::{Console, bytes, grouped};
 use crate::diagnostics::Result;
-use gazesplat_render::device::{Adapter, adapters};
+use gazesplat_render::device::Adapter;
 use serde_json::{Value as Json, json};
 use std::fmt::Write as _;
 
 /// Tells the devices on standard output; without a GPU adapter, the remedy on standard error.
 ///
 /// # Errors
-/// When standard output refuses.
+/// When a driver panics while it starts, or standard output refuses.
 pub(crate) fn tell(is_json: bool, console: &Console) -> Result<()> {
-    let found = adapters();
+    let found = device::adapters()?;
     if found.is_empty() {
         console.warn(NO_ADAPTER);
     }

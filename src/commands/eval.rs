@@ -60,7 +60,7 @@ pub struct EvalArgs {
 pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
     args.termination.check()?;
     let device = ComputeDevice::open(args.device.device, console)?;
-    device.guard(|| eval(args, &device, console))
+    eval(args, &device, console)
 }
 
 fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
@@ -71,8 +71,10 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
     let report = with_threads(config.train.threads, || {
         log_machine();
         let options = RenderOptions { termination: args.termination.termination()?, ..config.render_options() };
-        let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-        quality::measure(&splats, &images, &options, console)
+        device.guard(|| {
+            let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
+            quality::measure(&splats, &images, &options, console)
+        })
     })??;
     tracing::info!("images in memory: {} of {}", bytes(images.num_bytes() as u64), images.len());
     if let Some(out) = &args.out {

@@ -1,4 +1,5 @@
-//! Trains on a device that can be lost, and keeps a copy of the model on the host: what is left when the device is gone.
+//! Trains on a device that can be lost, and keeps a copy of the model on the host and on the disk: what is left when the
+//! device is gone, or takes the whole process with it.
 
 use gazesplat_core::GaussianCloud;
 use gazesplat_train::{Observer, Outcome, TrainEvent, Trainer};
@@ -6,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::device::ComputeDevice;
 use crate::diagnostics::Result;
+use crate::run_dir::RunDir;
 
 /// Copies in a run whose settings never measure the test views: as often as such a measurement is made at least.
 const COPIES_PER_RUN: u32 = 6;
@@ -19,8 +21,9 @@ pub(crate) struct Kept {
     pub cloud: GaussianCloud,
 }
 
-/// Trains as [`gazesplat_train::run`] does. On a GPU the model is copied into `kept` whenever the test views have been
-/// measured, and panics become errors; reading back changes nothing of the result.
+/// Trains as [`gazesplat_train::run`] does. On a GPU the model is copied into `kept` and the `unfinished.ply` of `run_dir`
+/// whenever the test views have been measured, and panics become errors; reading back changes nothing of the result. Who
+/// has saved the model removes the file.
 ///
 /// # Errors
 /// As [`gazesplat_train::run`]; `kept` then holds the last copy.
@@ -29,12 +32,13 @@ pub(crate) fn run(
     observers: &mut [&mut dyn Observer],
     stop: &AtomicBool,
     device: &ComputeDevice,
+    run_dir: &RunDir,
     kept: &mut Option<Kept>,
 ) -> Result<Outcome> {
     if !device.is_gpu() {
         return Ok(gazesplat_train::run(trainer, observers, stop)?);
     }
-    device.guard(|| in_legs(trainer, observers, stop, kept))
+    device.guard(|| in_legs(trainer, observers, stop, run_dir, kept))
 }
 
 /// A run in several legs, each ended by a pause in which the model is copied.
@@ -42,6 +46,7 @@ fn in_legs(
     trainer: &mut Trainer,
     observers: &mut [&mut dyn Observer],
     stop: &AtomicBool,
+    run_dir: &RunDir,
     kept: &mut Option<Kept>,
 ) -> Result<Outcome> {
     let config = &trainer.config().train;
@@ -55,7 +60,12 @@ fn in_legs(
         if outcome == Outcome::Finished || stop.load(Ordering::Relaxed) {
             return Ok(outcome);
         }
-        *kept = Some(Kept { step: trainer.step_index(), cloud: trainer.to_cloud()? });
+        let copy = Kept { step: trainer.step_index(), cloud: trainer.to_cloud()? };
+        // Drivers have been seen to end the process. A disk that is full today may not be at the end of the run.
+        if let Err(failure) = run_dir.write_unfinished(&copy.cloud) {
+            tracing::error!("no copy of step {}: {failure}", copy.step);
+        }
+        *kept = Some(copy);
         pause.store(false, Ordering::Relaxed);
     }
 }
@@ -99,6 +109,7 @@ impl Observer for Relay<'_, '_> {
 mod tests {
     use super::*;
     use gazesplat_core::io::images::ImageCache;
+    use gazesplat_core::io::ply;
     use gazesplat_core::synthetic::{SynthOptions, write_scene};
     use gazesplat_train::Config;
     use std::sync::Arc;
@@ -147,6 +158,10 @@ mod tests {
         Trainer::new(&dataset, images, &config, &gazesplat_render::cpu_device()).expect("valid")
     }
 
+    fn run_dir(dir: &std::path::Path) -> RunDir {
+        RunDir::create(&dir.join("run"), false).expect("writable")
+    }
+
     #[test]
     fn legs_look_like_one_run_and_give_its_model() {
         let dir = tempfile::tempdir().expect("temporary directory");
@@ -156,7 +171,7 @@ mod tests {
         gazesplat_train::run(&mut reference, &mut [&mut whole], &never).expect("trains");
         let mut trainer = trainer(&dir.path().join("b"), 10);
         let mut kept = None;
-        let outcome = in_legs(&mut trainer, &mut [&mut legs], &never, &mut kept).expect("trains");
+        let outcome = in_legs(&mut trainer, &mut [&mut legs], &never, &run_dir(dir.path()), &mut kept).expect("trains");
         assert_eq!(outcome, Outcome::Finished);
         assert_eq!(legs.told, whole.told);
         assert_eq!(trainer.to_cloud().expect("readable"), reference.to_cloud().expect("readable"));
@@ -169,12 +184,15 @@ mod tests {
         for (eval_every, fails_at, copied_at) in [(20, 29, 20), (0, 29, 25)] {
             let mut trainer = trainer(dir.path(), eval_every);
             let mut script = Script { fails_at: Some(fails_at), ..Script::default() };
-            let mut kept = None;
-            let failure = in_legs(&mut trainer, &mut [&mut script], &AtomicBool::new(false), &mut kept);
+            let (run_dir, mut kept) = (run_dir(dir.path()), None);
+            let failure = in_legs(&mut trainer, &mut [&mut script], &AtomicBool::new(false), &run_dir, &mut kept);
             assert_eq!(failure.expect_err("it fails").message(), "the device is gone");
             let kept = kept.expect("a copy");
             assert_eq!(kept.step, copied_at);
             assert!(!kept.cloud.is_empty());
+            assert_eq!(ply::load(run_dir.unfinished_path()).expect("on the disk, too"), kept.cloud);
+            run_dir.remove_unfinished().expect("writable");
+            assert!(!run_dir.unfinished_path().exists());
         }
     }
 
@@ -184,7 +202,8 @@ mod tests {
         let stop = AtomicBool::new(false);
         let mut trainer = trainer(dir.path(), 20);
         let mut script = Script { stops_at: Some((7, &stop)), ..Script::default() };
-        let outcome = in_legs(&mut trainer, &mut [&mut script], &stop, &mut None).expect("trains");
+        let outcome =
+            in_legs(&mut trainer, &mut [&mut script], &stop, &run_dir(dir.path()), &mut None).expect("trains");
         assert_eq!((outcome, trainer.step_index()), (Outcome::Stopped, 7));
     }
 }

@@ -35,13 +35,24 @@ struct Record {
     terms: BTreeMap<&'static str, f32>,
     /// Gaussians after the step.
     num_gaussians: usize,
-    /// Milliseconds by stage.
-    step_ms: StageMs,
+    /// Milliseconds of the step.
+    step_ms: StepMs,
     /// Quality on the test views, in the steps after which it was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     test: Option<TestScore>,
     #[serde(skip)]
     is_logged: bool,
+}
+
+/// Where the time of a step went, as far as it can be told.
+#[derive(Debug, Clone, Copy, Serialize)]
+#[serde(untagged)]
+enum StepMs {
+    /// On the CPU: its stages.
+    Stages(StageMs),
+    /// On a GPU, where stages are queued long before they are done: the mean of the steps since the line before. A step
+    /// with a line waits for all of them.
+    Total { total: f64 },
 }
 
 #[derive(Debug, Serialize)]
@@ -55,10 +66,14 @@ struct TestScore {
 pub(crate) struct Recorder {
     log: MetricsLog,
     log_every: u32,
+    is_gpu: bool,
     /// The latest step: written when the next one comes, since its test score comes after it.
     pending: Option<Record>,
     num_steps: u32,
     stage_sum_ms: [f64; NUM_STAGES],
+    total_sum_ms: f64,
+    /// Steps since the last line, and their milliseconds.
+    unwritten: (u32, f64),
     last_evaluation: Option<(u32, EvalReport)>,
     /// Logged steps.
     pub(crate) steps: Vec<StepPoint>,
@@ -67,22 +82,33 @@ pub(crate) struct Recorder {
 }
 
 impl Recorder {
-    /// Records every `log_every`-th step into `log`.
-    pub(crate) fn new(log: MetricsLog, log_every: u32) -> Self {
+    /// Records every `log_every`-th step into `log`; on a GPU without the times of stages.
+    pub(crate) fn new(log: MetricsLog, log_every: u32, is_gpu: bool) -> Self {
         Self {
             log,
             log_every,
+            is_gpu,
             pending: None,
             num_steps: 0,
             stage_sum_ms: [0.0; NUM_STAGES],
+            total_sum_ms: 0.0,
+            unwritten: (0, 0.0),
             last_evaluation: None,
             steps: Vec::new(),
             test_psnr: Vec::new(),
         }
     }
 
-    /// Mean milliseconds per step by stage.
+    /// Mean milliseconds per step.
+    pub(crate) fn mean_step_ms(&self) -> f64 {
+        self.total_sum_ms / f64::from(self.num_steps.max(1))
+    }
+
+    /// Mean milliseconds per step by stage; none on a GPU.
     pub(crate) fn mean_stages(&self) -> Vec<(String, f64)> {
+        if self.is_gpu {
+            return Vec::new();
+        }
         let n = f64::from(self.num_steps.max(1));
         STAGES.iter().zip(self.stage_sum_ms).map(|((name, _), ms)| ((*name).to_owned(), ms / n)).collect()
     }
@@ -93,8 +119,19 @@ impl Recorder {
         for ((_, ms), sum) in STAGES.iter().zip(&mut self.stage_sum_ms) {
             *sum += f64::from(ms(&report.stage_ms));
         }
+        let total_ms = f64::from(report.stage_ms.total);
+        self.total_sum_ms += total_ms;
+        self.unwritten = (self.unwritten.0 + 1, self.unwritten.1 + total_ms);
+        let step_ms = match self.is_gpu {
+            true => StepMs::Total { total: self.unwritten.1 / f64::from(self.unwritten.0) },
+            false => StepMs::Stages(report.stage_ms),
+        };
         let is_logged = report.is_logged(self.log_every);
-        if is_logged {
+        if let StepMs::Total { total } = step_ms
+            && is_logged
+        {
+            tracing::debug!("step {} on `{}`, {total:.2} ms on average", report.step, report.view);
+        } else if is_logged {
             let stages = || STAGES.iter().map(|(name, ms)| format!("{name} {:.2}", ms(&report.stage_ms)));
             tracing::debug!(
                 "step {} on `{}`, ms: {}",
@@ -111,7 +148,7 @@ impl Recorder {
             ssim: losses.get("ssim").unwrap_or(f32::NAN),
             terms: losses.terms.iter().map(|term| (term.name, term.value)).collect(),
             num_gaussians: report.num_gaussians,
-            step_ms: report.stage_ms,
+            step_ms,
             test: None,
             is_logged,
         });
@@ -137,6 +174,7 @@ impl Recorder {
         if record.is_logged || record.test.is_some() {
             self.steps.push(StepPoint { step: record.step, loss: record.loss, num_gaussians: record.num_gaussians });
             self.log.append(&record)?;
+            self.unwritten = (0, 0.0);
         }
         Ok(())
     }
@@ -158,5 +196,57 @@ impl Observer for Recorder {
             _ => {}
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run_dir::RunDir;
+    use gazesplat_train::losses::LossTerms;
+    use serde_json::{Value, json};
+
+    fn step(step: u32, total: f32) -> StepReport {
+        StepReport {
+            step,
+            num_steps: 6,
+            losses: Some(LossTerms { total: 0.5, terms: Vec::new() }),
+            num_gaussians: 7,
+            sh_degree: 0,
+            stage_ms: StageMs { forward: 0.25, total, ..StageMs::default() },
+            view: "a".to_owned(),
+            densified: None,
+        }
+    }
+
+    /// What is recorded of steps 1 to 6, of which 1 and every second are logged: `step_ms` of each line.
+    fn recorded(is_gpu: bool) -> (Recorder, Vec<Value>) {
+        let dir = tempfile::tempdir().expect("temporary directory");
+        let run_dir = RunDir::create(dir.path(), false).expect("writable");
+        let mut recorder = Recorder::new(run_dir.start_metrics().expect("writable"), 2, is_gpu);
+        for (index, total) in (1..).zip([8.0, 1.0, 3.0, 1.0, 5.0, 6.0]) {
+            recorder.on_event(&TrainEvent::Step(&step(index, total))).expect("writable");
+        }
+        recorder.flush().expect("writable");
+        let lines = std::fs::read_to_string(run_dir.metrics_path()).expect("readable");
+        let step_ms = |line| serde_json::from_str::<Value>(line).expect("JSON")["step_ms"].take();
+        let step_ms = lines.lines().map(step_ms).collect();
+        (recorder, step_ms)
+    }
+
+    #[test]
+    fn steps_on_a_gpu_have_a_mean_and_no_stages() {
+        let (recorder, step_ms) = recorded(true);
+        let means = [8.0, 1.0, 2.0, 5.5].map(|total| json!({ "total": total }));
+        assert_eq!(step_ms, means);
+        assert!(recorder.mean_stages().is_empty());
+        assert_eq!(recorder.mean_step_ms(), 4.0);
+    }
+
+    #[test]
+    fn steps_on_the_cpu_have_their_stages() {
+        let (recorder, step_ms) = recorded(false);
+        assert!(step_ms.len() == 4 && step_ms[3]["total"] == 6.0 && step_ms[3]["forward"] == 0.25, "{step_ms:?}");
+        assert_eq!((recorder.mean_stages()[1].1, recorder.mean_step_ms()), (0.25, 4.0));
     }
 }

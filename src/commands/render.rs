@@ -84,7 +84,7 @@ pub fn command(args: &RenderArgs, console: &Console) -> Result<()> {
     let target = Target::new(args)?;
     args.termination.check()?;
     let device = ComputeDevice::open(args.device.device, console)?;
-    device.guard(|| render(args, &target, &device, console))
+    render(args, &target, &device, console)
 }
 
 fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &Console) -> Result<()> {
@@ -119,20 +119,22 @@ fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &
         camera.intrinsics = replaced(camera.intrinsics, args.size, args.fov);
     }
 
-    let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
     let bar = progress::counting_bar(console, "rendering", cameras.len());
     let started = Instant::now();
     let mut stats: Vec<(String, RenderStats)> = Vec::new();
-    let frame = |camera: &NamedCamera| {
-        let (image, counters) = frames::draw(&splats, &camera.1, &options)?;
-        stats.push((camera.0.clone(), counters));
-        bar.inc(1);
-        Ok(image)
-    };
-    match target {
-        Target::Pngs(dir) => frames::write_pngs(dir, &cameras, frame)?,
-        Target::Video(file) => frames::write_video(file, &cameras, fps, frame)?,
-    }
+    device.guard(|| {
+        let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
+        let frame = |camera: &NamedCamera| {
+            let (image, counters) = frames::draw(&splats, &camera.1, &options)?;
+            stats.push((camera.0.clone(), counters));
+            bar.inc(1);
+            Ok(image)
+        };
+        match target {
+            Target::Pngs(dir) => frames::write_pngs(dir, &cameras, frame),
+            Target::Video(file) => frames::write_video(file, &cameras, fps, frame),
+        }
+    })?;
     bar.finish_and_clear();
     let (n, secs) = (cameras.len(), started.elapsed().as_secs_f64());
     match target {

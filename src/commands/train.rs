@@ -32,7 +32,7 @@ Examples:
   gazesplat train my_capture --device gpu
 
 Ctrl-C stops after the current step and keeps what there is; a second Ctrl-C ends at once. A run
-that fails leaves its last good model in `unfinished.ply`.")]
+that fails leaves its last good model in `unfinished.ply`; on a GPU copies go there on the way.")]
 pub struct TrainArgs {
     /// The scene: a COLMAP directory or one with `transforms.json`
     pub scene: PathBuf,
@@ -101,7 +101,7 @@ pub struct Trained {
 /// When the scene or the directory cannot be used, an image does not decode, the loss is no longer finite, or the GPU
 /// stops. Of a training that fails after its first step the last model that can be had is in `unfinished.ply`.
 pub fn train(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result<Trained> {
-    with_threads(job.config.train.threads, || job.device.guard(|| train_here(job, stop, console)))?
+    with_threads(job.config.train.threads, || train_here(job, stop, console))?
 }
 
 fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result<Trained> {
@@ -133,7 +133,8 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
     preload(&images, console)?;
-    let mut trainer = Trainer::new(&dataset, Arc::clone(&images), config, job.device.tensors())?;
+    let mut trainer =
+        job.device.guard(|| Ok(Trainer::new(&dataset, Arc::clone(&images), config, job.device.tensors())?))?;
     warnings.extend_from_slice(trainer.messages());
     let (measured, measured_images) = match dataset.test.is_empty() {
         false => (Measured::Test, Arc::clone(trainer.test_images())),
@@ -159,11 +160,11 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         run_dir.clear()?;
     }
     run_dir.write_settings(config, job.scene, &job.device.describe())?;
-    let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every);
+    let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every, job.device.is_gpu());
     let mut bar = TrainProgress::new(console, config.train.steps);
     let started = Instant::now();
     let mut kept = None;
-    let ended = keeper::run(&mut trainer, &mut [&mut recorder, &mut bar], stop, job.device, &mut kept);
+    let ended = keeper::run(&mut trainer, &mut [&mut recorder, &mut bar], stop, job.device, &run_dir, &mut kept);
     drop(bar);
     recorder.flush()?;
     let train_secs = started.elapsed().as_secs_f64();
@@ -171,6 +172,11 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     let num_steps = trainer.step_index();
     // A lost GPU takes the model with it; what a person waited for is then the last copy.
     let latest = job.device.guard(|| Ok(trainer.to_cloud()?));
+    // Giving back what is on a lost GPU may panic, too; there is nothing to lose by it.
+    let _ = job.device.guard(|| {
+        drop(trainer);
+        Ok(())
+    });
     let (outcome, cloud) = match (ended, latest) {
         (Ok(outcome), Ok(cloud)) => (outcome, cloud),
         (Err(failure), Ok(cloud)) if !cloud.is_empty() => {
@@ -179,20 +185,22 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         (Err(failure), _) | (Ok(_), Err(failure)) => return Err(salvage(failure, &run_dir, kept)),
     };
     run_dir.write_model(&cloud)?;
+    run_dir.remove_unfinished()?;
     if outcome == Outcome::Stopped {
         console.note(format_args!("stopped after {num_steps} of {} steps, saving what there is", config.train.steps));
     }
 
     let started = Instant::now();
     let options = config.render_options();
-    let splats = Splats::from_cloud(&cloud, job.device.tensors())?;
-    let eval = match recorder.take_evaluation(num_steps) {
-        // The run has just measured this very model.
-        Some(eval) if eval.num_gaussians == cloud.len() => eval,
-        _ => quality::measure(&splats, &measured_images, &options, console)?,
-    };
-    run_dir.write_eval(&eval)?;
-    let views = quality::panels(&splats, &measured_images, &options, &eval)?;
+    // The run may just have measured this very model.
+    let known = recorder.take_evaluation(num_steps).filter(|eval| eval.num_gaussians == cloud.len());
+    let (eval, views) = job.device.guard(|| {
+        let splats = Splats::from_cloud(&cloud, job.device.tensors())?;
+        let eval = known.map_or_else(|| quality::measure(&splats, &measured_images, &options, console), Ok)?;
+        run_dir.write_eval(&eval)?;
+        let views = quality::panels(&splats, &measured_images, &options, &eval)?;
+        Ok((eval, views))
+    })?;
     durations.push(("measuring".to_owned(), started.elapsed().as_secs_f64()));
 
     let mut test_psnr = std::mem::take(&mut recorder.test_psnr);
@@ -214,6 +222,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
             Figure::new(grouped(eval.num_gaussians), "", "Gaussians"),
             Figure::new(duration(train_secs), "", "training time"),
         ],
+        step_ms: recorder.mean_step_ms(),
         stages: recorder.mean_stages(),
         steps: std::mem::take(&mut recorder.steps),
         test_psnr,
@@ -253,7 +262,7 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
         return failure;
     };
     let path = run_dir.unfinished_path();
-    match gazesplat_core::io::ply::save(&path, &cloud) {
+    match run_dir.write_unfinished(&cloud) {
         Ok(()) => failure.hint_first(format!("the model as it was after step {step} is in `{}`", path.display())),
         Err(_) => failure,
     }

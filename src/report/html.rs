@@ -161,7 +161,7 @@ fn curves(out: &mut String, report: &Report) {
 }
 
 fn timings(out: &mut String, report: &Report) {
-    if report.stages.is_empty() && report.durations.is_empty() {
+    if report.stages.is_empty() && report.step_ms <= 0.0 && report.durations.is_empty() {
         return;
     }
     put!(out, "<section><h2>Time</h2>");
@@ -177,6 +177,13 @@ fn timings(out: &mut String, report: &Report) {
             put!(out, "<li><i class=\"s{i}\"></i>{} <b>{ms:.2} ms</b> {:.0} %</li>", escape(name), 100.0 * ms / total);
         }
         put!(out, "</ul>");
+    } else if report.step_ms > 0.0 {
+        put!(
+            out,
+            "<p>A training step took {:.1} ms on average. Its stages have no times of their own: ",
+            report.step_ms
+        );
+        put!(out, "a GPU works on what is queued while the next stage is being queued.</p>");
     }
     if !report.durations.is_empty() {
         put!(out, "<table>");
@@ -262,6 +269,9 @@ mod tests {
         for part in ["Fly-through", "Test views", "Loss", "PSNR on the test views", "Gaussians", "Time", "Settings"] {
             assert!(html.contains(part), "{part}");
         }
+        assert!(html.contains("backward <b>5.00 ms</b> 62 %") && !html.contains("no times of their own"));
+        let on_gpu = page(&Report { stages: Vec::new(), step_ms: 2.5, ..sample() });
+        assert!(on_gpu.contains("took 2.5 ms on average. Its stages have no times") && !on_gpu.contains("backward"));
         let trained_on = page(&Report { measured: Measured::Training, ..sample() });
         assert!(trained_on.contains("Training views") && trained_on.contains("PSNR on the training views"));
         assert!(!trained_on.contains("Test views") && !trained_on.contains("never saw"));

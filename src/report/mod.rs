@@ -45,7 +45,9 @@ pub struct Report {
     pub steps: Vec<StepPoint>,
     /// PSNR of the measured views over the run, (step, dB).
     pub test_psnr: Vec<(u32, f64)>,
-    /// Mean milliseconds per training step by stage, in the order of execution.
+    /// Mean milliseconds of a training step; 0 without one.
+    pub step_ms: f64,
+    /// The same by stage, in the order of execution; empty where stages cannot be told apart, on a GPU.
     pub stages: Vec<(String, f64)>,
     /// Some of the measured views with their renders.
     pub views: Vec<ViewPanel>,

@@ -105,6 +105,14 @@ fn gpu_trains_measures_and_draws_what_the_cpu_does() {
     assert_near(psnr(&place.read("gpu/eval.json")), on_cpu);
     assert_eq!(place.list("gpu"), place.list("run"));
     assert!(place.read("gpu/settings.toml").contains("\n# Computed on: gpu:"));
+    // Stages are queued, not done, when the host looks at its clock.
+    let metrics = place.read("gpu/metrics.jsonl");
+    for step_ms in metrics.lines().map(|line| json(line)["step_ms"].take()) {
+        let times = step_ms.as_object().expect("an object");
+        assert!(times.len() == 1 && times["total"].as_f64().is_some_and(|ms| ms > 0.0), "{step_ms}");
+    }
+    let report = place.read("gpu/report.html");
+    assert!(report.contains("ms on average. Its stages have no times of their own") && !report.contains("backward"));
 
     place.run(&["render", "run", "--scene", "scene", "--out", "cpu.y4m"]).done();
     place.run(&["render", "run", "--scene", "scene", "--out", "gpu.y4m", "--device", "gpu"]).done();

@@ -19,8 +19,14 @@ use gazesplat_render::layout::{ALPHA_MAX, NEAR, T_STOP};
 use gazesplat_render::view_params::view_params;
 use gazesplat_render::{RenderOptions, Splats, render};
 
-const OPTIONS: RasterOptions =
-    RasterOptions { alpha_max: ALPHA_MAX, t_stop: T_STOP, background: [0.0; 3], depth: false, smooth_cutoff: false };
+const OPTIONS: RasterOptions = RasterOptions {
+    alpha_max: ALPHA_MAX,
+    t_stop: T_STOP,
+    lut: None,
+    background: [0.0; 3],
+    depth: false,
+    smooth_cutoff: false,
+};
 
 fn wait(gpu: &Gpu) {
     cubecl::future::block_on(gpu.client.sync()).expect("the adapter answers");
@@ -61,7 +67,7 @@ fn gpu_passes(c: &mut Criterion) {
     };
     let fits = "the bench scene is within limits";
     let projected = project(&gpu, &g, &view).expect(fits);
-    let lists = bin(&gpu, &g, &projected, grid).expect(fits);
+    let lists = bin(&gpu, &g, &projected, grid, false).expect(fits);
     let raster = rasterize(&gpu, &lists, &OPTIONS, true).expect(fits);
     let v_image = raster.image.clone();
     let records = rasterize_bwd(&gpu, &lists, &OPTIONS, &raster, v_image.clone(), false).expect(fits);
@@ -77,7 +83,7 @@ fn gpu_passes(c: &mut Criterion) {
         });
     };
     pass("project", &|| drop(project(&gpu, &g, &view).expect(fits)));
-    pass("bin with sort and read-back", &|| drop(bin(&gpu, &g, &projected, grid).expect(fits)));
+    pass("bin with sort and read-back", &|| drop(bin(&gpu, &g, &projected, grid, false).expect(fits)));
     pass("rasterize", &|| drop(rasterize(&gpu, &lists, &OPTIONS, true).expect(fits)));
     pass("rasterize_bwd", &|| {
         drop(rasterize_bwd(&gpu, &lists, &OPTIONS, &raster, v_image.clone(), false).expect(fits));

@@ -10,6 +10,7 @@ use crate::layout::CLUSTER;
 use crate::math::alpha::{LN_2, LOG2_ALPHA_MIN};
 use crate::math::conic::DILATION;
 use crate::math::ewa::ViewParams;
+use crate::math::frustum::{Side, Sides, excludes};
 use crate::math::vec::{Vec3, combine, dot};
 use rayon::prelude::*;
 
@@ -52,25 +53,14 @@ pub fn clusters(gaussians: &GaussianSlices<'_>) -> Vec<Cluster> {
         .collect()
 }
 
-/// Half-spaces that contain everything a frame can show: near plane and the four sides, each widened by the footprint.
-///
-/// For the left side: the footprint ends left of the image iff fx x/z + cx + e < 0, where its half extent
-/// e ≤ √q (fx/z) √(1 + r²) σ + √(0.3 q), r the largest clamped ratio, σ the largest standard deviation and q = 2 ln 255
-/// the value on the contour α = 1/255 of an opaque Gaussian. Times z this is linear in the mean.
+/// Half-spaces that contain everything a frame can show: near plane and the four [`Sides`].
 #[derive(Debug, Clone, Copy)]
 pub struct Frustum {
-    sides: [Side; 4],
+    /// The four sides.
+    pub sides: Sides,
     depth_axis: Vec3,
     depth_offset: f32,
     near: f32,
-}
-
-/// Outside iff normal · p + offset + pad · σ < 0.
-#[derive(Debug, Clone, Copy)]
-struct Side {
-    normal: Vec3,
-    offset: f32,
-    pad: f32,
 }
 
 impl Frustum {
@@ -87,12 +77,12 @@ impl Frustum {
             pad: 1.001 * power2.sqrt() * f.abs() * (1.0 + ratio * ratio).sqrt(),
         };
         Self {
-            sides: [
-                side(view.fx, w.row0, t.x, view.cx, rx),
-                side(-view.fx, w.row0, t.x, width - view.cx, rx),
-                side(view.fy, w.row1, t.y, view.cy, ry),
-                side(-view.fy, w.row1, t.y, height - view.cy, ry),
-            ],
+            sides: Sides {
+                left: side(view.fx, w.row0, t.x, view.cx, rx),
+                right: side(-view.fx, w.row0, t.x, width - view.cx, rx),
+                top: side(view.fy, w.row1, t.y, view.cy, ry),
+                bottom: side(-view.fy, w.row1, t.y, height - view.cy, ry),
+            },
             depth_axis: w.row2,
             depth_offset: t.z,
             near,
@@ -102,7 +92,7 @@ impl Frustum {
     /// Whether a Gaussian in front of the near plane with largest standard deviation `scale` lies outside for certain.
     #[inline(always)]
     pub fn excludes(&self, mean: Vec3, scale: f32) -> bool {
-        self.sides.iter().any(|s| dot(s.normal, mean) + s.offset + s.pad * scale < 0.0)
+        excludes(self.sides, mean, scale)
     }
 
     /// Whether every member of `cluster` lies outside for certain.
@@ -111,8 +101,7 @@ impl Frustum {
         let center = Vec3 { x, y, z };
         let reach = |n: Vec3| n.x.abs() * cluster.half[0] + n.y.abs() * cluster.half[1] + n.z.abs() * cluster.half[2];
         dot(self.depth_axis, center) + self.depth_offset + reach(self.depth_axis) <= self.near * 0.999
-            || self
-                .sides
+            || [self.sides.left, self.sides.right, self.sides.top, self.sides.bottom]
                 .iter()
                 .any(|s| dot(s.normal, center) + s.offset + s.pad * cluster.scale + reach(s.normal) < 0.0)
     }

@@ -27,9 +27,15 @@ impl FromStr for DeviceChoice {
         match text {
             "cpu" => Ok(Self::Cpu),
             "gpu" => Ok(Self::Gpu),
-            _ => text.strip_prefix("gpu:").and_then(|n| n.parse().ok()).map(Self::GpuIndex).ok_or_else(refused),
+            _ => text.strip_prefix("gpu:").and_then(parse_index).map(Self::GpuIndex).ok_or_else(refused),
         }
     }
+}
+
+/// A number as [`DeviceChoice`] writes it: each has one spelling, `+0` and `00` are none.
+fn parse_index(text: &str) -> Option<usize> {
+    let is_plain = text.bytes().all(|b| b.is_ascii_digit()) && (text == "0" || !text.starts_with('0'));
+    if is_plain { text.parse().ok() } else { None }
 }
 
 impl fmt::Display for DeviceChoice {
@@ -217,13 +223,13 @@ mod wgpu_adapters {
                 driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
                 max_buffer_bytes: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
                 max_buffers: limits.max_storage_buffers_per_shader_stage,
-                max_units: limits.max_compute_invocations_per_workgroup,
+                max_units: limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x),
                 max_shared_bytes: limits.max_compute_workgroup_storage_size,
                 max_workgroups: limits.max_compute_workgroups_per_dimension,
                 plane_sizes: [info.subgroup_min_size, info.subgroup_max_size],
                 is_default: index == default,
                 usable: check_limits(
-                    limits.max_compute_invocations_per_workgroup,
+                    limits.max_compute_invocations_per_workgroup.min(limits.max_compute_workgroup_size_x),
                     limits.max_storage_buffers_per_shader_stage,
                     limits.max_compute_workgroup_storage_size as usize,
                 ),
@@ -274,10 +280,10 @@ mod tests {
 
     #[test]
     fn choices_read_back_and_nonsense_is_refused() {
-        for choice in [DeviceChoice::Cpu, DeviceChoice::Gpu, DeviceChoice::GpuIndex(3)] {
+        for choice in [DeviceChoice::Cpu, DeviceChoice::Gpu, DeviceChoice::GpuIndex(0), DeviceChoice::GpuIndex(10)] {
             assert_eq!(choice.to_string().parse(), Ok(choice));
         }
-        for bad in ["", "GPU", "gpu:", "gpu:-1", "cuda", "cpu:0"] {
+        for bad in ["", "GPU", "gpu:", "gpu:-1", "gpu:+0", "gpu:00", "gpu:01", "gpu: 0", "gpu:1 ", "cuda", "cpu:0"] {
             assert!(bad.parse::<DeviceChoice>().is_err(), "{bad}");
         }
     }

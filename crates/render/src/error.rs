@@ -26,12 +26,12 @@ pub enum Error {
         /// The range.
         expected: &'static str,
     },
-    /// The frame needs more of something than the backend has.
-    #[error("{what}: this frame needs {needed}, the limit is {limit}")]
+    /// A frame, a model or a kernel needs more of something than the backend has.
+    #[error("{what}: {needed} needed, the limit is {limit}")]
     Limit {
         /// The resource.
         what: &'static str,
-        /// What the frame needs.
+        /// What is needed.
         needed: u64,
         /// What there is.
         limit: u64,
@@ -51,16 +51,25 @@ pub enum Error {
 }
 
 impl Error {
-    /// What the driver of a GPU says: its first sentences, without the chain of consequences and the backtrace.
+    /// What the driver of a GPU says: what failed first and why in the end, without what lies between and the backtrace.
     pub fn device(cause: &dyn std::fmt::Display) -> Self {
-        const MAX_CHARS: usize = 240;
+        const MAX_CHARS: usize = 160;
+        let brief = |text: &str| {
+            let mut text = text.split_whitespace().collect::<Vec<_>>().join(" ");
+            if let Some((end, _)) = text.char_indices().nth(MAX_CHARS) {
+                text.truncate(end);
+                text.push('…');
+            }
+            text
+        };
         let text = cause.to_string();
         let first = text.split("\nBacktrace").next().unwrap_or_default();
-        let mut message = first.split_whitespace().collect::<Vec<_>>().join(" ");
-        if let Some((end, _)) = message.char_indices().nth(MAX_CHARS) {
-            message.truncate(end);
-            message.push('…');
-        }
+        let mut causes = first.split("Caused by:");
+        let failed = brief(causes.next().unwrap_or_default());
+        let message = match causes.last() {
+            Some(last) => format!("{failed}: {}", brief(last)),
+            None => failed,
+        };
         Self::Device { message }
     }
 
@@ -91,7 +100,10 @@ mod tests {
     #[test]
     fn what_a_driver_says_is_cut_to_its_first_sentences() {
         let said = |text: &str| Error::device(&text).to_string();
-        assert_eq!(said("lost\nCaused by:\n  a fall\nBacktrace:\n 1 2 3"), "the GPU stopped: lost Caused by: a fall");
+        assert_eq!(
+            said("lost\nCaused by:\n  a push\nCaused by:\n  a fall\nBacktrace:\n 1 2 3"),
+            "the GPU stopped: lost: a fall"
+        );
         assert!(said(&"ä ".repeat(500)).ends_with('…') && said(&"ä ".repeat(500)).chars().count() < 300);
     }
 }

@@ -14,6 +14,9 @@ pub const ALPHA_MAX: f32 = 0.999;
 /// Largest clamp of α a caller may ask for: above it 1 − α loses more than three digits of the gradient.
 pub const ALPHA_MAX_LIMIT: f32 = 0.9999;
 
+/// Guard of 1 − α before the backward pass divides by it; above [`ALPHA_MAX_LIMIT`] only rounding could reach it.
+pub const ONE_MINUS_ALPHA_MIN: f32 = 1e-6;
+
 /// Default transmittance at which a pixel stops (Kerbl 2023, App. C).
 pub const T_STOP: f32 = 1e-4;
 

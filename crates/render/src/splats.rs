@@ -28,8 +28,7 @@ impl Splats {
         let n = cloud.len();
         #[cfg(feature = "gpu")]
         if let Some(gpu) = crate::gpu::Gpu::from_device(device) {
-            // The largest of the five.
-            gpu.check_size("bytes of SH coefficients", &[n, cloud.num_coefficients(), 3], burn::tensor::DType::F32)?;
+            gpu.check_model(n, cloud.num_coefficients())?;
         }
         let flat = |rows: &[[f32; 3]]| rows.as_flattened().to_vec();
         let sh_shape = [n, cloud.num_coefficients(), 3];

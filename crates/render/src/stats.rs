@@ -3,13 +3,17 @@
 use serde::Serialize;
 
 /// What one frame did and what it could skip.
+///
+/// On a GPU [`num_pairs_used`](Self::num_pairs_used), [`num_lane_pixels`](Self::num_lane_pixels) and
+/// [`num_tiles_empty`](Self::num_tiles_empty) are counted only where [`crate::StatsMode`] asks for counters, and 0 otherwise:
+/// they would cost every frame a second read-back.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
 pub struct RenderStats {
     /// Gaussians in the model.
     pub num_splats: u64,
     /// Gaussians culled because a parameter, or what was computed from it, is not finite.
     pub num_culled_non_finite: u64,
-    /// Gaussians that were skipped with their whole cluster, without being read.
+    /// Gaussians that were skipped with their whole cluster, without being read; on a CPU only.
     pub num_culled_by_cluster: u64,
     /// Gaussians whose box around the contour α = 1/255 reaches a pixel centre.
     pub num_visible: u64,
@@ -19,7 +23,8 @@ pub struct RenderStats {
     pub num_pairs: u64,
     /// Pairs worked through before their tile had stopped.
     pub num_pairs_used: u64,
-    /// Lane-pixels computed: 16 for every tile row a pair visits.
+    /// Lane-pixels computed: on a CPU 16 for every tile row a pair visits; on a GPU, where a unit is a pixel, 256 for every
+    /// pair in use.
     pub num_lane_pixels: u64,
     /// Pixels blended, over all pairs; filled by [`crate::StatsMode::All`] only.
     pub num_blended: u64,

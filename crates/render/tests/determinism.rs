@@ -79,3 +79,5 @@ fn skipping_whole_clusters_does_not_change_the_image() {
     assert!(skipping.stats.num_culled_by_cluster > 0 && reading.stats.num_culled_by_cluster == 0);
     assert!(skipping.image == reading.image && skipping.splat_stats == reading.splat_stats);
 }
+
+crate::common::on_gpu!(counting_does_not_change_the_image, depth_does_not_change_the_other_channels,);

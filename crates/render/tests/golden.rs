@@ -1,4 +1,4 @@
-//! Images and gradients against the golden records (`tests/golden/README.md`), on every CPU backend.
+//! Images and gradients against the golden records (`tests/golden/README.md`), on every backend.
 //!
 //! The bound is five times the error that the oracle itself makes in float32, from each record. `--nocapture` prints the
 //! table. Which records there are is not known here: whatever `render_*.json` the golden directory holds is run.

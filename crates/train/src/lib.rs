@@ -13,6 +13,7 @@ pub mod event;
 mod host;
 pub mod init;
 pub mod kernels;
+mod limits;
 pub mod losses;
 #[cfg_attr(
     feature = "gpu",

@@ -15,6 +15,7 @@ use crate::evaluate::{EvalReport, evaluate};
 use crate::event::{StageMs, StepReport};
 use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
 use crate::kernels::cpu::rows::Rows;
+use crate::limits::check_limits;
 use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses};
 use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, schedule};
 use crate::rng::{Stream, draw, permutation, uniform};
@@ -73,6 +74,7 @@ impl Trainer {
         if images.is_empty() {
             return Err(Error::NoTrainingViews { num_test: dataset.test.len() });
         }
+        check_limits(cloud, &images, config, device)?;
         let extent = positive_extent(dataset.scene_extent());
         let cameras: Vec<Camera> = images.views().iter().map(|v| v.camera).collect();
         let center: [f32; 3] = camera_center(&cameras).into();

@@ -246,6 +246,42 @@ fn a_loss_that_is_no_number_stops_the_run_and_keeps_the_model() {
     assert!(failed.windows(2).all(|w| w[0] == w[1]), "{failed:?}");
 }
 
+/// Destroys the device at step 12.
+#[cfg(feature = "gpu")]
+struct Destroyer<F>(F);
+
+#[cfg(feature = "gpu")]
+impl<F: Fn()> Observer for Destroyer<F> {
+    fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+        if let TrainEvent::Step(report) = event
+            && report.step == 12
+        {
+            (self.0)();
+        }
+        Ok(())
+    }
+}
+
+#[cfg(feature = "gpu")]
+#[test]
+fn a_gpu_that_is_lost_in_a_run_is_an_error() {
+    if required_gpu(gpu_device(None)).is_none() {
+        return;
+    }
+    let (_scratch, dataset) = scene("lost", 4);
+    // A device of its own: the one that the other tests share has to live.
+    let (device, setup) = Device::wgpu_options().init_with_setup().unwrap();
+    let mut trainer = trainer_on(&dataset, &config(40, 2500), &device);
+    let mut destroyer = Destroyer(|| setup.device.destroy());
+    let error = run(&mut trainer, &mut [&mut destroyer], &AtomicBool::new(false)).unwrap_err();
+    println!("{error}");
+    let is_device_error = |error: &Error| matches!(error, Error::Render(gazesplat_render::Error::Device { .. }));
+    assert!(is_device_error(&error), "{error:?}");
+    // At the latest where the host waits for the device.
+    assert!((12..20).contains(&trainer.step_index()), "{}", trainer.step_index());
+    assert!(trainer.to_cloud().is_err_and(|error| is_device_error(&error)), "the model is gone with it");
+}
+
 #[cfg(feature = "flex")]
 #[test]
 fn both_cpu_backends_train_the_same_model() {

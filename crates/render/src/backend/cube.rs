@@ -30,6 +30,9 @@ struct DeviceFrame {
 
 fn draw(gpu: &Gpu, g: &GaussianBuffers, frame: &Frame) -> Result<DeviceFrame> {
     let grid = TileGrid::new(frame.view.width, frame.view.height);
+    // What is known to be too large is refused before any work.
+    let (width, height) = (frame.view.width as usize, frame.view.height as usize);
+    gpu.check_size("bytes of the image", &[height, width, frame.raster.num_channels()], DType::F32)?;
     let projected = project(gpu, g, &frame.view)?;
     let wants_maximum = frame.raster.lut.as_ref().is_some_and(|lut| lut.color_max() == ColorMax::Tile);
     let lists = bin(gpu, g, &projected, grid, wants_maximum)?;

@@ -23,6 +23,7 @@ pub mod conic;
 pub mod covariance;
 pub mod ewa;
 pub mod footprint;
+pub mod frustum;
 pub mod quat;
 pub mod sh;
 pub mod tile;

@@ -139,7 +139,7 @@ impl Refinement {
 #[backend_extension(NdArray, Flex: cfg(feature = "flex"), Cube: cfg(feature = "gpu"))]
 pub trait OptimOps: Backend {
     /// Closes the state if `loss`, `[1]`, is not finite; else adds the gradients of the regularisers to `gradients` and
-    /// does one update of all parameters. A group whose gradient has no rows is left alone.
+    /// does one update of all parameters. Every group has its gradient.
     fn adam(
         #[extension_type] state: State<Self>,
         #[extension_type] gradients: Parameters<Self>,

@@ -7,6 +7,8 @@
 //!
 //! With a termination table a pixel also stops before a splat when its colour allows it (JND Sec. 3). The table is looked
 //! at for rows only in which some pixel has come within reach of its largest entry.
+//!
+//! A few lines over the aim: image, counters and table are one loop with options at compile time, not three copies.
 
 use super::bin::TileLists;
 use super::lut::{Line, TileLut, below_limit, needs_fixed, residual, tile_lut};
@@ -269,6 +271,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kern
 }
 
 /// Blends one splat into the rows it reaches. Returns the number of rows visited.
+#[expect(clippy::too_many_arguments, reason = "the state of the loop, passed in registers")]
 #[inline(always)]
 fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8>(
     s: S,

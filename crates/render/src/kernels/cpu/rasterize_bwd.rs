@@ -9,16 +9,13 @@
 use super::bin::TileLists;
 use super::rasterize::{Raster, RasterOptions, smooth_cutoff};
 use super::tile::{BATCH, CENTERS, RasterSplat, Row, RowI, Staged, TileRect, raster_splats, stage};
-use crate::layout::{TILE, grad_lane, lane};
+use crate::layout::{ONE_MINUS_ALPHA_MIN, TILE, grad_lane, lane};
 use crate::math::alpha::{LN_2, LOG2_ALPHA_MIN};
 use crate::simd::{Kernel, LANES, Simd, dispatch};
 use rayon::prelude::*;
 
 /// Gradient of one (splat, tile) pair, lanes as in [`grad_lane`].
 pub type Record = [f32; grad_lane::COUNT];
-
-/// Guard of 1 − α before it divides.
-const ONE_MINUS_ALPHA_MIN: f32 = 1e-6;
 
 /// Pixels of one tile row, going backwards.
 #[derive(Debug, Clone, Copy)]

@@ -22,6 +22,9 @@ use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 
+/// Most tiles of an image: 256 splats that reach all of them still have less than 2³² pairs.
+const MAX_TILES: usize = (1 << 24) - 1;
+
 /// Places in the buffer of counters that is read back.
 mod counter {
     /// Visible splats V.
@@ -76,6 +79,9 @@ pub fn bin(
 ) -> Result<TileLists> {
     let n = g.len;
     let Projected { lanes, visible_offsets } = projected;
+    if grid.len() > MAX_TILES {
+        return Err(Error::Limit { what: "tiles of an image", needed: grid.len() as u64, limit: MAX_TILES as u64 });
+    }
     let counters = gpu.zeros("bytes of counters", &[counter::COUNT], DType::U32)?;
     // 1. The visible splats, front to back.
     let keys = gpu.empty("bytes of sort keys", &[n], DType::U32)?;
@@ -143,7 +149,8 @@ pub fn bin(
             grid.tiles_y as f32,
         );
     }
-    let tile_bits = usize::BITS - grid.len().saturating_sub(1).leading_zeros();
+    // One number more than there are tiles: see `emit`.
+    let tile_bits = usize::BITS - grid.len().leading_zeros();
     let (pair_tiles, pair_records) =
         radix_sort(gpu, pair_tiles, pair_records, num_pairs, &record_offsets, n, tile_bits)?;
     // 5. Lists: where each tile's begins, and what stands in them.
@@ -282,7 +289,7 @@ fn count_tiles(
         num_tiles[r] = count;
     }
     sync_cube();
-    // The sum of 256 splats fits 32 bits (an image has less than 2²⁴ tiles); a wrapped low word carries.
+    // The sum of 256 splats fits 32 bits: an image has at most MAX_TILES tiles. A wrapped low word carries.
     if UNIT_POS < 2 {
         let sum = sums[UNIT_POS as usize].load();
         let low = (UNIT_POS * 2) as usize + counter::PAIRS;
@@ -334,9 +341,9 @@ fn emit(
                 }
             }
         }
-        // For the same reason none may stay unwritten; a pair of a tile that the splat does not reach blends nothing.
+        // For the same reason none may stay unwritten: they go behind the last tile, into no list.
         while record < end {
-            pair_tiles[record as usize] = 0u32;
+            pair_tiles[record as usize] = u32::cast_from(tiles_x) * u32::cast_from(tiles_y);
             pair_splats[record as usize] = r as u32;
             pair_records[record as usize] = record;
             record += 1u32;
@@ -363,7 +370,8 @@ fn list_pairs(
         let record = pair_records[p];
         pairs[p * 2] = pair_splats[record as usize];
         pairs[p * 2 + 1] = record;
-        // A list begins behind the last pair of an earlier tile; tiles between two pairs are empty.
+        // A list begins behind the last pair of an earlier tile; tiles between two pairs are empty. The number behind the
+        // last tile ends the last list.
         let tile = pair_tiles[p];
         if comptime!(wants_maximum) {
             let at = pair_splats[record as usize] as usize * lane::COUNT + lane::RED;

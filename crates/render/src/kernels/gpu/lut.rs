@@ -1,6 +1,6 @@
 //! What the rasterisers do with a termination table: reading it, asking it, and what becomes of the rest.
 //!
-//! Device functions; one unit per pixel. A table of up to [`IN_WORKGROUP`] entries is copied into workgroup memory, where
+//! Device functions; one unit per pixel. A table of up to 512 entries is copied into workgroup memory, where
 //! the 256 pixels of a tile read different entries at no cost; a larger one stays in its buffer.
 
 use super::tile::TileArgs;
@@ -99,7 +99,7 @@ pub fn below_limit(
 /// Cell of a channel.
 #[cube]
 fn cell(value: f32, size: u32) -> u32 {
-    let clamped = f32::min(f32::max(value, 0.0_f32), BELOW_ONE);
+    let clamped = f32::clamp(value, 0.0_f32, BELOW_ONE);
     u32::min(u32::cast_from(clamped * f32::cast_from(size)), size - 1u32)
 }
 

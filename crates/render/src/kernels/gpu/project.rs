@@ -6,6 +6,7 @@
 
 use super::scan::exclusive_scan;
 use crate::backend::Parameters;
+use crate::cluster::Frustum;
 use crate::error::Result;
 use crate::gpu::device_fn::is_finite;
 use crate::gpu::{Gpu, contiguous, cube_dim};
@@ -14,6 +15,7 @@ use crate::layout::{ALPHA_MIN, DET_MIN, EXTENT_SLACK, QUAT_NORM2_MIN, lane};
 use crate::math::alpha::{LOG2_E, contour_power2, sigmoid};
 use crate::math::ewa::{ViewParams, ViewParamsLaunch, to_camera, view_direction};
 use crate::math::footprint::footprint;
+use crate::math::frustum::{Side, SideLaunch, Sides, SidesLaunch, excludes};
 use crate::math::quat::Quat;
 use crate::math::sh;
 use crate::math::vec::{Mat3, Mat3Launch, Vec3, Vec3Launch};
@@ -89,6 +91,12 @@ pub fn view_launch(view: &ViewParams) -> ViewParamsLaunch {
     )
 }
 
+/// The sides of the frustum as a kernel argument.
+fn sides_launch(sides: &Sides) -> SidesLaunch {
+    let side = |s: Side| SideLaunch::new(Vec3Launch::new(s.normal.x, s.normal.y, s.normal.z), s.offset, s.pad);
+    SidesLaunch::new(side(sides.left), side(sides.right), side(sides.top), side(sides.bottom))
+}
+
 /// Projects all Gaussians.
 ///
 /// # Errors
@@ -109,6 +117,7 @@ pub fn project(gpu: &Gpu, g: &GaussianBuffers, view: &ViewSpec) -> Result<Projec
             lanes.clone().into_buffer_arg(),
             visible.clone().into_buffer_arg(),
             view_launch(&view.params),
+            sides_launch(&Frustum::new(&view.params, view.width as f32, view.height as f32, view.near).sides),
             view.width as f32,
             view.height as f32,
             view.near,
@@ -155,6 +164,7 @@ fn project_kernel(
     lanes: &mut [f32],
     visible: &mut [u32],
     view: ViewParams,
+    sides: Sides,
     width: f32,
     height: f32,
     near: f32,
@@ -193,6 +203,9 @@ fn project_kernel(
         terminate!();
     }
     let scales = exp3(log_scale);
+    if excludes(sides, mean, f32::max(f32::max(scales.x, scales.y), scales.z)) {
+        terminate!();
+    }
     // 2.–4. Σ' = J W Σ Wᵀ Jᵀ + 0.3 I and its inverse (Zwicker 2001; Kerbl 2023, Eq. 5).
     let fp = footprint(view, in_camera, quat, scales);
     if fp.unit.norm * fp.unit.norm < QUAT_NORM2_MIN || fp.dilated.det <= DET_MIN {

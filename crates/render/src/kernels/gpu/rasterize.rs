@@ -152,9 +152,10 @@ fn rasterize_kernel(
     let none = comptime!(None);
     let end = composite(lanes, tile_offsets, pairs, lanes, tile_offsets, image, tile_ends, &args, depth, smooth, none);
     if comptime!(keep) {
+        let pixel = end.index as usize;
         if end.is_inside {
-            final_t[end.index as usize] = end.t;
-            stop[end.index as usize] = end.stopped_at;
+            final_t[pixel] = end.t;
+            stop[pixel] = end.stopped_at;
         }
     }
 }

@@ -6,6 +6,9 @@
 //! batch in workgroup memory. In the second, 32 units per splat reduce these to six moments of v, from which mean, conic
 //! and opacity follow, and to the sums for colour and depth.
 //!
+//! α has to come out as in the forward pass, which the same device function sees to. Should a driver compile it otherwise
+//! here, a pixel that lies on the cut is taken to have blended a splat it has not: its T is then off by 1/255, once.
+//!
 //! Every pair writes its own record, at the place its splat has reserved: no float is added atomically, so the gradient
 //! has the same bits on every run, and drivers without such atomics need no other path. Records behind the end of a tile
 //! are zero.
@@ -16,7 +19,7 @@ use super::tile::{STAGED, TileArgs, pixel, stage, staged_splat, tile_args};
 use crate::error::Result;
 use crate::gpu::{Gpu, SHARED_BYTES, UNITS, cube_dim};
 use crate::kernels::cpu::rasterize::RasterOptions;
-use crate::layout::{TILE, grad_lane, lane};
+use crate::layout::{ONE_MINUS_ALPHA_MIN, TILE, grad_lane, lane};
 use crate::math::alpha::LN_2;
 use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
@@ -30,12 +33,9 @@ const UNITS_PER_SPLAT: usize = UNITS as usize / BATCH;
 const PIXELS_PER_UNIT: usize = BATCH;
 const _: () = assert!(UNITS_PER_SPLAT == 2 * TILE, "a unit keeps its column");
 const _: () = assert!(
-    4 * (STAGED * BATCH + (2 * BATCH + 4) * UNITS as usize + 1) <= SHARED_BYTES,
-    "adapters are asked for less workgroup memory than this kernel takes"
+    4 * (STAGED * BATCH + (2 * BATCH + 4) * UNITS as usize + 1) == SHARED_BYTES,
+    "adapters are asked for the workgroup memory that this kernel takes"
 );
-
-/// Guard of 1 − α before it divides.
-const ONE_MINUS_ALPHA_MIN: f32 = 1e-6;
 
 /// Gradients of all pairs, by record: `[P, 12]`, lanes as in [`grad_lane`].
 ///

@@ -2,7 +2,8 @@
 //!
 //! A pass of its own composites every tile again: in batches of eight splats, pixels leave the weights they blend in
 //! workgroup memory, and 32 units per splat sum, count and take the largest. Every pair has its own counters, which are
-//! then summed per splat, one unit each. All sums are integers or have a fixed order, and all maxima are exact.
+//! then summed per splat, one unit each. All sums are integers or have a fixed order, and all maxima are exact. Counters go
+//! to the host, so a frame that is asked for them reads back twice: the number of pairs, and here.
 
 use super::bin::TileLists;
 use super::lut::{LutUse, below_limit, limits, tile_lut};
@@ -83,10 +84,8 @@ pub fn splat_stats(
     if mode == StatsMode::None {
         return Ok((out, 0));
     }
-    let offsets = gpu.read_u32(&lists.tile_offsets)?;
-    let num_empty = offsets.windows(2).filter(|w| w[0] == w[1]).count() as u64;
     if lists.num_pairs == 0 {
-        return Ok((out, num_empty));
+        return Ok((out, lists.grid.len() as u64));
     }
     let counters = gpu.zeros("bytes of pair counters", &[lists.num_pairs, pair_word::COUNT], DType::U32)?;
     count_pairs::launch(
@@ -118,8 +117,8 @@ pub fn splat_stats(
         per_splat.clone().into_buffer_arg(),
         lists.num_visible as u32,
     );
-    let words = gpu.read_u32(&per_splat)?;
-    let ids = gpu.read_u32(&lists.global_from_compact)?;
+    let [words, ids, offsets] = gpu.read_all_u32([&per_splat, &lists.global_from_compact, &lists.tile_offsets])?;
+    let num_empty = offsets.windows(2).filter(|w| w[0] == w[1]).count() as u64;
     for (row, &id) in words.chunks_exact(splat_word::COUNT).zip(&ids) {
         let i = id as usize;
         out.tiles_used[i] = row[splat_word::USED];

@@ -1,8 +1,8 @@
 //! `gazesplat bench termination`: the study of JND (Table 1, Fig. 7) on any model and scene.
 //!
 //! Every rule draws every view: against the photographs, against the image without any termination, and, interleaved frame
-//! by frame so that all rules meet the same state of the machine, against the clock. Long because the list of rules, what
-//! is measured of each and the order of the measurements are read together.
+//! by frame so that all rules meet the same state of the machine, against the clock. A long file, because the list of
+//! rules, what is measured of each and the order of the measurements are read together.
 
 mod output;
 

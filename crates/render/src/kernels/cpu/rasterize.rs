@@ -298,8 +298,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
     let t_stop = s.splat(options.t_stop);
     let (zero, position) = (s.splat(0.0), s.splat_i(index));
     let (mut num_blended, mut weight_max, mut weight_sum) = (0, s.splat(0.0), s.splat(0.0));
-    let mut y = first;
-    for (row, center) in rows[first..end].iter_mut().zip(&CENTERS[first..end]) {
+    for (y, (row, center)) in (first..).zip(rows[first..end].iter_mut().zip(&CENTERS[first..end])) {
         let dy = s.splat(center - g.mean_y);
         let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
         // Compared before the exponential; false for NaN.
@@ -326,7 +325,6 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
             blended = ahead;
             now = s.gt_where(s.and_not(hit, blended), t, zero);
         }
-        y += 1;
         let weight = s.mul_where(blended, alpha, t);
         let t_new = s.select(blended, t_next, t);
         // Else no branch: under the fixed rule some pixel of a dense tile stops at almost every splat.

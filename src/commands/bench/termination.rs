@@ -1,7 +1,7 @@
 //! `gazesplat bench termination`: the study of JND (Table 1, Fig. 7) on any model and scene.
 //!
 //! Every rule draws every view: against the photographs, against the image without any termination, and, interleaved frame
-//! by frame so that all rules meet the same state of the machine, against the clock. A long file, because the list of
+//! by frame so that all rules meet the same state of the machine, against the clock. The file is long because the list of
 //! rules, what is measured of each and the order of the measurements are read together.
 
 mod output;

@@ -222,7 +222,9 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, extras: BinExtras) -> Resul
     let record_pairs: Vec<AtomicU32> =
         (0..if extras.records { num_pairs } else { 0 }).map(|_| AtomicU32::new(0)).collect();
     let is_bright: Vec<bool> = match extras.color_max {
-        true => rows.iter().map(|s| s[lane::RED..lane::RED + 3].iter().any(|&c| c > 1.0)).collect(),
+        true => {
+            rows.par_iter().with_min_len(CHUNK).map(|s| s[lane::RED..lane::RED + 3].iter().any(|&c| c > 1.0)).collect()
+        }
         false => Vec::new(),
     };
     let mut color_max = vec![0.0f32; if extras.color_max { grid.len() } else { 0 }];

@@ -83,18 +83,20 @@ fn limits_of_other_colours_are_those_of_the_oracle() {
     }
 }
 
-/// The ratios of the specification, to its two digits: over the voxel minima of the encoded metric.
+/// The ratios of the specification over the voxel minima of the encoded metric: median and maximum to its two digits. Its
+/// minimum, 1.02, is not reproduced: 1.0148 here, which rounds to 1.01. What is proven of it is the theorem, that no centred
+/// limit is below the corner one.
 #[test]
-fn centred_limits_of_the_table_are_1_02_to_2_times_the_corner_ones() {
+fn centred_limits_of_the_table_are_1_to_2_times_the_corner_ones() {
     let limits = |residual| spec(Rule::Vertex, ColorSpace::Srgb, Sample::VoxelMin, residual).limits().expect("builds");
     let mut ratios: Vec<f64> =
         limits(Residual::Centre).iter().zip(limits(Residual::Drop)).map(|(a, b)| a / b).collect();
     ratios.sort_by(f64::total_cmp);
     let (min, median, max) = (ratios[0], 0.5 * (ratios[255] + ratios[256]), ratios[511]);
     println!("minimum {min:.3}, median {median:.3}, maximum {max:.3}");
-    for (found, expected) in [(min, 1.02), (median, 1.21), (max, 2.0)] {
-        // The smallest is 1.0148 here, which the specification rounds up.
-        assert!((found - expected).abs() < 0.0055, "{found}, expected {expected}");
+    assert!(min >= 1.0, "{min}");
+    for (found, expected) in [(median, 1.21), (max, 2.0)] {
+        assert!((found - expected).abs() < 0.005, "{found}, expected {expected}");
     }
 }
 

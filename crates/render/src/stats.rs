@@ -44,7 +44,8 @@ impl RenderStats {
     }
 }
 
-/// Work and worth of each Gaussian in one view, `[N]` each; empty where the [`crate::StatsMode`] does not fill it.
+/// Work and worth of each Gaussian in one view, `[N]` each, and the work of each pixel; empty where the
+/// [`crate::StatsMode`] does not fill it.
 ///
 /// A tile's list is walked front to back until its last pixel has stopped, at position E; a pixel blends an entry iff
 /// α ≥ 1/255 and T(1−α) is above the stopping transmittance. All counters are integers or maxima, so they do not depend
@@ -63,4 +64,6 @@ pub struct SplatStats {
     pub weight_sum: Vec<u64>,
     /// Tiles in which it is blended in at least one pixel.
     pub tiles_blended: Vec<u32>,
+    /// Gaussians blended in each pixel, `[H·W]`; with [`crate::StatsMode::All`].
+    pub blends_of_pixels: Vec<u32>,
 }

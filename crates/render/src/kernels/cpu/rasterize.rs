@@ -59,6 +59,8 @@ pub struct Raster<'a> {
     pub tile_ends: Cow<'a, [u32]>,
     /// Counters of each pair, in list order, `[P]`; empty unless asked for.
     pub pair_stats: Vec<PairStats>,
+    /// Splats blended in each pixel, `[H, W]`; empty unless all counters are asked for.
+    pub blends: Vec<u32>,
     /// Per-tile counters, summed.
     pub stats: RenderStats,
 }
@@ -68,7 +70,7 @@ pub struct Raster<'a> {
 struct PixelRow {
     /// Transmittance; negative once the pixel has stopped.
     t: Row,
-    /// R, G, B, Σ T α z.
+    /// R, G, B, Σ T α z; a pass for all counters has no depth and keeps the number of blended splats in its place.
     channels: [Row; 4],
     /// List position of the stop.
     stop: RowI,
@@ -99,6 +101,8 @@ pub fn rasterize(
     let mut image = vec![0.0; width * height * channels];
     let (mut final_t, mut stop) = (vec![0.0; num_kept], vec![0; num_kept]);
     let mut tile_ends = vec![0; lists.grid.len()];
+    let counts_blends = level == StatsLevel::All;
+    let mut blends = vec![0; if counts_blends { width * height } else { 0 }];
     let splats = &raster_splats(splats);
     let mut tile_stats = vec![Vec::new(); lists.grid.tiles_y as usize];
     // A missing plane is cut into empty strips, so that all planes zip.
@@ -108,10 +112,11 @@ pub fn rasterize(
         .zip(strips_of(&mut image, strip(channels), lists))
         .zip(strips_of(&mut final_t, strip(usize::from(keep)), lists))
         .zip(strips_of(&mut stop, strip(usize::from(keep)), lists))
+        .zip(strips_of(&mut blends, strip(usize::from(counts_blends)), lists))
         .zip(tile_ends.par_chunks_mut(lists.grid.tiles_x as usize))
         .zip(tile_stats.par_iter_mut())
-        .map(|(((((tile_y, image), final_t), stop), tile_ends), pair_stats)| {
-            let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats };
+        .map(|((((((tile_y, image), final_t), stop), blends), tile_ends), pair_stats)| {
+            let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, blends, tile_ends, pair_stats };
             if let Some(lut) = &options.lut {
                 return match (needs_fixed(lut, options.t_stop), level, options.depth) {
                     (false, StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, LUT_ALONE>(strip)),
@@ -144,6 +149,7 @@ pub fn rasterize(
         stop: stop.into(),
         tile_ends: tile_ends.into(),
         pair_stats: tile_stats.into_iter().flatten().collect(),
+        blends,
         stats,
     }
 }
@@ -168,6 +174,7 @@ struct Strip<'a> {
     image: &'a mut [f32],
     final_t: &'a mut [f32],
     stop: &'a mut [i32],
+    blends: &'a mut [u32],
     tile_ends: &'a mut [u32],
     pair_stats: &'a mut Vec<PairStats>,
 }
@@ -190,7 +197,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kern
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> RenderStats {
-        let Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats } = self.0;
+        let Strip { splats, lists, options, tile_y, image, final_t, stop, blends, tile_ends, pair_stats } = self.0;
         let (width, height) = (lists.grid.width as usize, lists.grid.height as usize);
         let mut stats = RenderStats::default();
         let mut staged = [Staged::default(); BATCH];
@@ -252,6 +259,10 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kern
                 );
                 if STATS == 2 {
                     stats.num_blended += counters.iter().map(|c| u64::from(c.pixels_blended)).sum::<u64>();
+                    for (y, row) in rows[..tile.height].iter().enumerate() {
+                        let counts = &mut blends[y * width + tile.x0..][..tile.width];
+                        counts.iter_mut().zip(&row.channels[3].0).for_each(|(to, &count)| *to = count as u32);
+                    }
                 }
             } else {
                 write_colors::<S, DEPTH, LUT>(s, &rows, &tile, width, options, lut, image);
@@ -348,6 +359,8 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
             weight_max = s.max(weight_max, weight);
             if STATS == 2 {
                 num_blended += s.bits(blended).count_ones();
+                let count = s.load(&row.channels[3].0);
+                s.store(s.select(blended, s.add(count, s.splat(1.0)), count), &mut row.channels[3].0);
                 weight_sum = s.add(weight_sum, weight);
             }
         }

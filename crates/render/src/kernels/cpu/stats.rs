@@ -83,6 +83,7 @@ pub fn splat_stats(
         pixels_blended: vec![0; rows(StatsMode::All)],
         weight_sum: vec![0; rows(StatsMode::All)],
         tiles_blended: vec![0; rows(StatsMode::All)],
+        blends_of_pixels: raster.blends.clone(),
     };
     if mode >= StatsMode::Tiles {
         for (&start, &end) in lists.tile_offsets.iter().zip(raster.tile_ends.iter()) {

@@ -90,21 +90,40 @@ impl TileLut<'_> {
     }
 }
 
-/// Pixels of a row among `alive` that stop because the rest cannot be seen: T·c_max ≤ γ·LUT(C) (JND Sec. 3).
+/// Pixels of a row among `hit` that go on, and those that stop because the rest cannot be seen: T·c_max ≤ γ·LUT(C)
+/// (JND Sec. 3). Those that have stopped before are neither.
 #[inline(always)]
-pub(super) fn below_limit<S: Simd>(
+pub(super) fn clear_or_stop<S: Simd>(
     s: S,
     lut: TileLut<'_>,
-    alive: S::M,
+    hit: S::M,
     t: S::F,
     channels: &[Row; 4],
     line: &mut Line,
-) -> S::M {
+) -> (S::M, S::M) {
+    let zero = s.splat(0.0);
     let left = s.mul(t, s.splat(lut.color_max));
-    let near = s.and_not(alive, s.gt(left, s.load(&line.values.0)));
+    // Stopped pixels have T < 0, below every line.
+    let clear = s.gt_where(hit, left, s.load(&line.values.0));
+    let near = s.gt_where(s.and_not(hit, clear), t, zero);
     if s.bits(near) & !line.is_final == 0 {
-        return near;
+        return (clear, near);
     }
+    let stop = look_up(s, lut, near, t, left, channels, line);
+    (s.and_not(s.gt_where(hit, t, zero), stop), stop)
+}
+
+/// The pixels among `near` that stop, by the table; lowers the line.
+#[inline(always)]
+fn look_up<S: Simd>(
+    s: S,
+    lut: TileLut<'_>,
+    near: S::M,
+    t: S::F,
+    left: S::F,
+    channels: &[Row; 4],
+    line: &mut Line,
+) -> S::M {
     let size = s.splat(lut.size);
     // No closures over arrays: what is not inlined is compiled for the baseline processor.
     let (red, green, blue) = (s.load(&channels[0].0), s.load(&channels[1].0), s.load(&channels[2].0));

@@ -11,7 +11,7 @@
 //! A few lines over the aim: image, counters and table are one loop with options at compile time, not three copies.
 
 use super::bin::TileLists;
-use super::lut::{Line, TileLut, below_limit, needs_fixed, residual, tile_lut};
+use super::lut::{Line, TileLut, clear_or_stop, needs_fixed, residual, tile_lut};
 use super::stats::{PairStats, StatsLevel};
 use super::tile::{BATCH, CENTERS, RasterSplat, Row, RowI, Staged, TileRect, raster_splats, stage};
 use crate::layout::{TILE, lane};
@@ -324,27 +324,20 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
         // Kerbl 2023, App. C: stop before the splat that would end the pixel.
         let (blended, now);
         if LUT == LUT_ALONE {
-            let alive = s.gt_where(hit, t, zero);
-            now = below_limit(s, lut, alive, t, &row.channels, &mut lines[y]);
-            blended = s.and_not(alive, now);
+            (blended, now) = clear_or_stop(s, lut, hit, t, &row.channels, &mut lines[y]);
         } else {
             let mut ahead = s.gt_where(hit, t_next, t_stop);
             if LUT == LUT_AND_FIXED {
-                let alive = s.gt_where(hit, t, zero);
-                ahead = s.and_not(ahead, below_limit(s, lut, alive, t, &row.channels, &mut lines[y]));
+                ahead = s.and_not(ahead, clear_or_stop(s, lut, hit, t, &row.channels, &mut lines[y]).1);
             }
             blended = ahead;
             now = s.gt_where(s.and_not(hit, blended), t, zero);
         }
         let weight = s.mul_where(blended, alpha, t);
+        // No branch: in a dense tile some pixel stops at almost every splat.
         let t_new = s.select(blended, t_next, t);
-        // Else no branch: under the fixed rule some pixel of a dense tile stops at almost every splat.
-        if LUT == LUT_ALONE && s.bits(now) == 0 {
-            s.store(t_new, &mut row.t.0);
-        } else {
-            s.store(s.select(now, s.neg_abs(t), t_new), &mut row.t.0);
-            s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
-        }
+        s.store(s.select(now, s.neg_abs(t), t_new), &mut row.t.0);
+        s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
         if STATS == 0 || LUT != NO_LUT {
             let num = if DEPTH { 4 } else { 3 };
             for (sum, channel) in row.channels[..num].iter_mut().zip(channels) {

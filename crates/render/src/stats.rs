@@ -23,8 +23,8 @@ pub struct RenderStats {
     pub num_pairs: u64,
     /// Pairs worked through before their tile had stopped.
     pub num_pairs_used: u64,
-    /// Lane-pixels computed: on a CPU 16 for every tile row a pair visits; on a GPU, where a unit is a pixel, 256 for every
-    /// pair in use.
+    /// Lane-pixels computed: on a CPU 16 for every tile row that a pair visits, which leaves out rows whose pixels have all
+    /// stopped; on a GPU, where a unit is a pixel, 256 for every pair in use.
     pub num_lane_pixels: u64,
     /// Pixels blended, over all pairs; filled by [`crate::StatsMode::All`] only.
     pub num_blended: u64,

@@ -3,7 +3,8 @@
 //! One task per row of tiles; per tile, splats are staged in batches and each visits the rows its ellipse reaches,
 //! sixteen pixels at a time. The state of the 256 pixels stays in the first-level cache. A pixel that has stopped
 //! keeps its transmittance with the sign flipped: the test "T(1−α) > T_stop" then fails for every later splat without
-//! a mask. A tile ends when all its pixels have stopped. Empty lists give the background.
+//! a mask. A tile ends when all its pixels have stopped, a row of one is left out from the next look on, eight splats later at
+//! most. Empty lists give the background.
 //!
 //! With a termination table a pixel also stops before a splat when its colour allows it (JND Sec. 3). The table is looked
 //! at for rows only in which some pixel has come within reach of its largest entry.
@@ -219,7 +220,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kern
             if STATS > 0 {
                 pair_stats.resize(first_pair + list.len(), PairStats::default());
             }
-            let mut alive = true;
+            let mut alive = rows_alive(s, &rows[..tile.height]);
             for (batch, indices) in list.chunks(BATCH).enumerate() {
                 stage(splats, indices, &tile, &mut staged);
                 for (part, chunk) in staged[..indices.len()].chunks(CHECK).enumerate() {
@@ -234,21 +235,22 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kern
                             options,
                             lut,
                             &mut lines,
+                            alive,
                             counters,
                         );
                         stats.num_lane_pixels += (num_rows * LANES) as u64;
                     }
-                    alive = any_alive(s, &rows[..tile.height]);
-                    if !alive {
+                    alive = rows_alive(s, &rows[..tile.height]);
+                    if alive == 0 {
                         break;
                     }
                 }
-                if !alive {
+                if alive == 0 {
                     break;
                 }
             }
             // E: where the last pixel stopped; entries before it were worked through, those after it changed nothing.
-            let end = if alive { list.len() } else { last_stop(&rows, &tile) };
+            let end = if alive != 0 { list.len() } else { last_stop(&rows, &tile) };
             stats.num_pairs_used += end as u64;
             *tile_end = end as u32;
             if STATS > 0 {
@@ -281,7 +283,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kern
     }
 }
 
-/// Blends one splat into the rows it reaches. Returns the number of rows visited.
+/// Blends one splat into the rows it reaches and in which some pixel is `alive`, as bits. Returns the number of rows visited.
 #[expect(clippy::too_many_arguments, reason = "the state of the loop, passed in registers")]
 #[inline(always)]
 fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8>(
@@ -292,10 +294,14 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
     options: &RasterOptions,
     lut: TileLut<'_>,
     lines: &mut [Line; TILE],
+    alive: u32,
     counters: Option<&mut PairStats>,
 ) -> usize {
-    let (first, end) = (g.first_row as usize, (g.end_row as usize).min(TILE));
-    if first >= end {
+    // Rows whose pixels have all stopped are left out.
+    let reached = (1u32 << g.end_row.min(TILE as u32)).wrapping_sub(1u32 << g.first_row.min(TILE as u32));
+    let mut open = if g.first_row < g.end_row { reached & alive } else { 0 };
+    let num_rows = open.count_ones() as usize;
+    if open == 0 {
         return 0;
     }
     // log2 α = yy dy² + xy dx dy + (xx dx² + log2 o)
@@ -309,7 +315,10 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
     let t_stop = s.splat(options.t_stop);
     let (zero, position) = (s.splat(0.0), s.splat_i(index));
     let (mut num_blended, mut weight_max, mut weight_sum) = (0, s.splat(0.0), s.splat(0.0));
-    for (y, (row, center)) in (first..).zip(rows[first..end].iter_mut().zip(&CENTERS[first..end])) {
+    while open != 0 {
+        let y = open.trailing_zeros() as usize % TILE;
+        open &= open - 1;
+        let (row, center) = (&mut rows[y], CENTERS[y]);
         let dy = s.splat(center - g.mean_y);
         let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
         // Compared before the exponential; false for NaN.
@@ -366,7 +375,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
             counters.set_blended(num_blended, s.reduce_sum4(weight_sum, zero, zero, zero)[0]);
         }
     }
-    end - first
+    num_rows
 }
 
 /// The test-only smooth cut: α·h(u) and its derivative with respect to α, u = clamp(255 α − 1, 0, 1), h(u) = u²(3 − 2u).
@@ -382,11 +391,11 @@ pub(super) fn smooth_cutoff<S: Simd>(s: S, alpha: S::F) -> (S::F, S::F) {
 /// Splats between two looks at whether the tile has ended.
 const CHECK: usize = 8;
 
-/// Whether some pixel has not stopped.
+/// Rows in which some pixel has not stopped, as bits.
 #[inline(always)]
-fn any_alive<S: Simd>(s: S, rows: &[PixelRow]) -> bool {
-    let largest = rows.iter().fold(s.splat(-1.0), |m, row| s.max(m, s.load(&row.t.0)));
-    s.bits(s.gt(largest, s.splat(0.0))) != 0
+fn rows_alive<S: Simd>(s: S, rows: &[PixelRow]) -> u32 {
+    let is_alive = |row: &PixelRow| s.bits(s.gt(s.load(&row.t.0), s.splat(0.0))) != 0;
+    rows.iter().enumerate().map(|(y, row)| u32::from(is_alive(row)) << y).sum()
 }
 
 /// The largest stop position of the pixels inside the image.

@@ -108,7 +108,7 @@ fn a_table_for_linear_light_is_refused_unless_it_is_the_papers() {
 
 #[test]
 fn the_study_compares_every_rule() {
-    let place = Place::with_run();
+    let place = with_table(Place::with_run());
     let args = ["bench", "termination", "run", "--scene", "scene", "--views", "1", "--repeats", "1", "--out", "study"];
     let ended = place.run(&args).done();
     let files = [
@@ -143,6 +143,14 @@ fn the_study_compares_every_rule() {
     assert!(report["not_measured"].to_string().contains("LPIPS"));
     let strict = rows.iter().find(|r| r["rule"] == "strict" && r["gamma"] == 1.0).expect("a row");
     assert!(strict["delta_e_max"].as_f64().expect("a number") <= 1.05, "{strict}");
+    let own = [&args[..], &["--lut", "table.json", "--gamma", "3"]].concat();
+    let rows: serde_json::Value = serde_json::from_str(&place.run(&own).done().stdout).expect("JSON");
+    let last = rows.as_array().and_then(|rows| rows.last()).expect("rows");
+    assert!(last["rule"] == "given" && last["gamma"] == 3.0, "{last}");
+    for (option, value) in [("--gamma", "-1"), ("--lut", "missing.json")] {
+        let refused = place.run(&[&args[..], &["--termination", "jnd", option, value]].concat()).refused();
+        assert!(refused.contains(value), "{refused}");
+    }
     let refused = place.run(&["bench", "termination", "run", "--scene", "scene", "--repeats", "0"]).refused();
     assert!(refused.contains("nothing would be measured"));
     let refused = place.run(&["bench", "termination", "run", "--scene", "scene", "--pixels-per-degree", "0"]).refused();

@@ -10,7 +10,7 @@ mod output;
 mod stops;
 
 use super::super::device::ComputeDevice;
-use super::super::termination::constant;
+use super::super::termination::{TerminationArgs, constant};
 use super::super::{Model, Split, load_scene, log_machine};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::Console;
@@ -32,6 +32,7 @@ use std::path::PathBuf;
 Examples:
   gazesplat bench termination model.ply --scene fox --out study
   gazesplat bench termination runs/fox-1 --scene fox --views 4 --repeats 9 --device gpu
+  gazesplat bench termination model.ply --scene fox --lut mine.json --gamma 2
 
 Writes termination.csv, termination.json, error_over_time.svg, flip_over_time.svg,
 quality_over_gamma.svg, and of the first view three maps for the strict table at γ = 1, black to pale
@@ -56,6 +57,9 @@ pub struct StudyArgs {
     /// Pixels per degree of visual angle, for FLIP
     #[arg(long, value_name = "N", default_value_t = PIXELS_PER_DEGREE)]
     pub pixels_per_degree: f64,
+    /// A rule of one's own beside the others
+    #[command(flatten)]
+    pub termination: TerminationArgs,
     /// Settings
     #[command(flatten)]
     pub settings: SettingsArgs,
@@ -119,6 +123,7 @@ pub fn command(args: &StudyArgs, console: &Console) -> Result<()> {
     if args.repeats == 0 || args.views == Some(0) {
         return Err(Failure::new("nothing would be measured").hint("give 1 or more with `--repeats` and `--views`"));
     }
+    args.termination.check()?;
     let flip = Flip::new(args.pixels_per_degree)?;
     let device = ComputeDevice::open(args.device.device, console)?;
     device.guard(|| study(args, flip, &device, console))
@@ -156,6 +161,9 @@ fn study(args: &StudyArgs, flip: Flip, device: &ComputeDevice, console: &Console
         for gamma in GAMMAS {
             rules.push(table_rule(name, table.clone(), gamma)?);
         }
+    }
+    if args.termination.is_given() {
+        rules.push(("given".to_owned(), args.termination.gamma, args.termination.termination()?));
     }
     let mut rows = bench.measure(&rules)?;
     bench.time(&mut rows, args.repeats)?;

@@ -17,9 +17,12 @@ pub(super) struct TileLut<'a> {
     /// γ times the entries, `[size³]`.
     limits: &'a [f32],
     size: f32,
+    /// How many there are.
+    cells: f32,
     /// The largest of them.
     largest: f32,
-    /// For each cell the largest limit its colours can still come to; empty where that is not known.
+    /// For each set of axes and each cell the largest limit that its colours can still come to along them; empty where that
+    /// is not known.
     limits_ahead: &'a [f32],
     /// Cells ahead that it covers.
     ahead: f32,
@@ -37,6 +40,7 @@ pub(super) fn tile_lut<'a>(options: &'a RasterOptions, lists: &TileLists<'_>, id
         return TileLut {
             limits: &[],
             size: 0.0,
+            cells: 0.0,
             largest: 0.0,
             limits_ahead: &[],
             ahead: 0.0,
@@ -59,6 +63,7 @@ pub(super) fn tile_lut<'a>(options: &'a RasterOptions, lists: &TileLists<'_>, id
     TileLut {
         limits,
         size,
+        cells: limits.len() as f32,
         largest,
         limits_ahead,
         ahead: lut.ahead() as f32,
@@ -134,22 +139,24 @@ fn look_up<S: Simd>(
     if lut.limits_ahead.is_empty() {
         return stop;
     }
-    // Channels never shrink: from here on a colour meets the entries ahead of its cell only, and that of its cell alone
-    // where all that is left does not lead out of it. Neighbours come down together, so that the whole row learns of it,
+    // Channels never shrink: from here on a colour meets the entries only that lie ahead of its cell along the axes on which
+    // all that is left leads out of it, and that of its cell alone where there is no such axis. Neighbours come down together, so that the whole row learns of it,
     // as far as what is left is less than what `limits_ahead` covers.
     let reach = s.mul(left, s.splat(lut.reach));
     let near_enough = s.gt(s.splat(lut.ahead), s.mul(reach, size));
     let stay = s.and_not(s.gt_where(near_enough, t, s.splat(0.0)), stop);
     // What is final stays so, whatever rounding makes of a second look.
     let stay = s.and_not(stay, s.mask(line.is_final));
-    let last = s.and_not(stay, s.gt(place(s, s.add(red, reach), size), r));
-    let last = s.and_not(last, s.gt(place(s, s.add(green, reach), size), g));
-    let last = s.and_not(last, s.gt(place(s, s.add(blue, reach), size), b));
-    let mut values = s.select(last, limit, s.load(&line.values.0));
-    let open = s.and_not(stay, last);
-    if s.bits(open) != 0 {
-        values = s.select(open, s.lookup(lut.limits_ahead, cell), values);
-    }
+    let (zero, two) = (s.splat(0.0), s.splat(2.0));
+    let farther_r = s.sub(place(s, s.add(red, reach), size), r);
+    let farther_g = s.sub(place(s, s.add(green, reach), size), g);
+    let farther_b = s.sub(place(s, s.add(blue, reach), size), b);
+    let one = s.splat(1.0);
+    let axes = s.fma(s.min(farther_r, one), two, s.min(farther_g, one));
+    let axes = s.fma(axes, two, s.min(farther_b, one));
+    let at = s.fma(axes, s.splat(lut.cells), cell);
+    let values = s.select(stay, s.lookup(lut.limits_ahead, at), s.load(&line.values.0));
+    let last = s.and_not(stay, s.gt(axes, zero));
     s.store(values, &mut line.values.0);
     line.is_final |= s.bits(last);
     stop

@@ -182,19 +182,22 @@ impl Flip {
             let (found, expected) = (vec![b.height, b.width], vec![a.height, a.width]);
             return Err(Error::Shape { name: "second image", found, expected });
         }
-        let knee = P_COLOR * self.largest;
         let pixels = a.colors.par_iter().zip(&b.colors).zip(a.features.par_iter().zip(&b.features));
-        let error = |((a, b), (f, g)): ((&DVec3, &DVec3), (&[f64; 2], &[f64; 2]))| {
-            let color = distance(*a, *b).powf(Q_COLOR);
-            let color = if color < knee {
-                P_TARGET / knee * color
-            } else {
-                P_TARGET + (color - knee) / (self.largest - knee) * (1.0 - P_TARGET)
-            };
-            let feature = (f[0] - g[0]).abs().max((f[1] - g[1]).abs());
-            color.powf(1.0 - (feature / 2f64.sqrt()).powf(Q_FEATURE))
+        Ok(pixels.map(|((a, b), (f, g))| self.error([*a, *b], [*f, *g])).collect())
+    }
+
+    /// The error of a pixel from the colours and features of both images (FLIP Sec. 4.1.4, 4.2 and 4.3).
+    fn error(&self, colors: [DVec3; 2], features: [[f64; 2]; 2]) -> f64 {
+        let knee = P_COLOR * self.largest;
+        let color = distance(colors[0], colors[1]).powf(Q_COLOR);
+        let color = if color < knee {
+            P_TARGET / knee * color
+        } else {
+            P_TARGET + (color - knee) / (self.largest - knee) * (1.0 - P_TARGET)
         };
-        Ok(pixels.map(error).collect())
+        let [f, g] = features;
+        let feature = (f[0] - g[0]).abs().max((f[1] - g[1]).abs());
+        color.powf(1.0 - (feature / 2f64.sqrt()).powf(Q_FEATURE))
     }
 
     /// Lab of a linear colour with the chroma that its lightness leaves (Hunt effect, FLIP Sec. 4.1.3).

@@ -106,7 +106,7 @@ fn values_are_within_0_and_1_for_the_wildest_images() {
             let data = (0..3 * 23 * 17).map(|_| rng.below(levels) as f32 / (levels - 1) as f32).collect();
             ImageF32 { width: 23, height: 17, data }
         };
-        let (a, b) = (image(2), image(if seed % 2 == 0 { 2 } else { 256 }));
+        let (a, b) = (image(2), image(if seed < 10 { 2 } else { 256 }));
         for ppd in [5.0, PIXELS_PER_DEGREE, 200.0] {
             let flip = Flip::new(ppd).expect("legal");
             assert!(map(&flip, &a, &b).iter().all(|f| (0.0..=1.0).contains(f)), "{seed} {ppd}");
@@ -117,7 +117,7 @@ fn values_are_within_0_and_1_for_the_wildest_images() {
 /// Seen from farther away, fine structure vanishes: a chequerboard of single pixels beside its mean.
 #[test]
 fn fine_structure_is_seen_from_near_only() {
-    let board = |x: usize, y: usize| if (x + y) % 2 == 0 { 1.0 } else { 0.0 };
+    let board = |x: usize, y: usize| if (x + y).is_multiple_of(2) { 1.0 } else { 0.0 };
     let data: Vec<f32> = (0..64 * 64).flat_map(|i| [board(i % 64, i / 64); 3]).collect();
     let a = ImageF32 { width: 64, height: 64, data };
     // 0.5 of the light, encoded.

@@ -37,6 +37,11 @@ impl TerminationArgs {
         self.termination.unwrap_or(if self.lut.is_some() { Kind::Jnd } else { Kind::Fixed })
     }
 
+    /// Whether any of the options was given.
+    pub fn is_given(&self) -> bool {
+        self.termination.is_some() || self.lut.is_some() || self.gamma.is_some()
+    }
+
     /// Checks what can be checked before any work.
     ///
     /// # Errors

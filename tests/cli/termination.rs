@@ -108,18 +108,52 @@ fn a_table_for_linear_light_is_refused_unless_it_is_the_papers() {
 
 #[test]
 fn the_study_compares_every_rule() {
-    let place = Place::with_run();
+    let place = with_table(Place::with_run());
     let args = ["bench", "termination", "run", "--scene", "scene", "--views", "1", "--repeats", "1", "--out", "study"];
     let ended = place.run(&args).done();
-    let files = ["delta_e.png", "error_over_time.svg", "left.png", "quality_over_gamma.svg", "termination.csv"];
-    assert_eq!(place.list("study"), [&files[..], &["termination.json"]].concat());
+    let files = [
+        "delta_e.png",
+        "error_over_time.svg",
+        "flip.png",
+        "flip_over_time.svg",
+        "quality_over_gamma.svg",
+        "saved.png",
+        "termination.csv",
+        "termination.json",
+    ];
+    assert_eq!(place.list("study"), files);
     let rows: serde_json::Value = serde_json::from_str(&ended.stdout).expect("JSON");
     let rows = rows.as_array().expect("rows");
-    assert_eq!(rows.len(), 16);
-    assert_eq!(place.read("study/termination.csv").lines().count(), 17);
+    assert_eq!(rows.len(), 17);
+    let csv = place.read("study/termination.csv");
+    let columns = "rule,gamma,psnr,ssim,psnr_to_full,delta_e_max,delta_e_p999,above_one,flip,flip_p999,blends_per_pixel,\
+                   lane_pixels_per_pixel,ms,speed_up";
+    assert_eq!(csv.lines().next(), Some(columns));
+    assert_eq!(csv.lines().count(), 18);
+    for row in rows {
+        let number = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key}: {row}"));
+        assert!((0.0..=1.0).contains(&number("flip")) && number("flip") <= number("flip_p999"), "{row}");
+        assert!(number("lane_pixels_per_pixel") >= number("blends_per_pixel") && number("ms") > 0.0, "{row}");
+    }
+    let report: serde_json::Value = serde_json::from_str(&place.read("study/termination.json")).expect("JSON");
+    let stops = &report["stops_of_strict"];
+    let shares = ["below_constant", "above_constant"].map(|g| stops[g]["share"].as_f64().expect("a share"));
+    assert!((shares[0] + shares[1] - 1.0).abs() < 1e-9, "{stops}");
+    assert!(stops["centred_over_dropped"]["min"].as_f64().expect("a number") >= 1.0, "{stops}");
+    assert!(report["not_measured"].to_string().contains("LPIPS"));
     let strict = rows.iter().find(|r| r["rule"] == "strict" && r["gamma"] == 1.0).expect("a row");
     assert!(strict["delta_e_max"].as_f64().expect("a number") <= 1.05, "{strict}");
+    let own = [&args[..], &["--lut", "table.json", "--gamma", "3"]].concat();
+    let rows: serde_json::Value = serde_json::from_str(&place.run(&own).done().stdout).expect("JSON");
+    let last = rows.as_array().and_then(|rows| rows.last()).expect("rows");
+    assert!(last["rule"] == "given" && last["gamma"] == 3.0, "{last}");
+    for (option, value) in [("--gamma", "-1"), ("--lut", "missing.json")] {
+        let refused = place.run(&[&args[..], &["--termination", "jnd", option, value]].concat()).refused();
+        assert!(refused.contains(value), "{refused}");
+    }
     let refused = place.run(&["bench", "termination", "run", "--scene", "scene", "--repeats", "0"]).refused();
     assert!(refused.contains("nothing would be measured"));
+    let refused = place.run(&["bench", "termination", "run", "--scene", "scene", "--pixels-per-degree", "0"]).refused();
+    assert!(refused.contains("pixels per degree"));
     fs::remove_dir_all(place.path("study")).expect("there");
 }

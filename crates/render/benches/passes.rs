@@ -4,8 +4,10 @@
 //! so `thrpt` is lane-pixels per second of one core; its inverse is the figure of BENCHMARKS.md.
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use gazesplat_core::color::ColorSpace;
 use gazesplat_core::synthetic::{bench_camera, bench_cloud};
 use gazesplat_core::{Camera, GaussianCloud};
+use gazesplat_render::TerminationLut;
 use gazesplat_render::kernels::cpu::bin::{BinExtras, TileGrid, TileLists, bin};
 use gazesplat_render::kernels::cpu::project::{GaussianSlices, ProjectedSplats, ViewSpec, project};
 use gazesplat_render::kernels::cpu::project_bwd::project_bwd;
@@ -13,7 +15,7 @@ use gazesplat_render::kernels::cpu::rasterize::{RasterOptions, rasterize};
 use gazesplat_render::kernels::cpu::rasterize_bwd::rasterize_bwd;
 use gazesplat_render::kernels::cpu::sort::depth_order;
 use gazesplat_render::kernels::cpu::stats::StatsLevel;
-use gazesplat_render::layout::{ALPHA_MAX, NEAR, T_STOP, lane};
+use gazesplat_render::layout::{ALPHA_MAX, NEAR, T_FLOOR, T_STOP, lane};
 use gazesplat_render::simd::{SimdLevel, force_level};
 use gazesplat_render::view_params::view_params;
 use std::hint::black_box;
@@ -27,7 +29,7 @@ const OPTIONS: RasterOptions = RasterOptions {
     smooth_cutoff: false,
 };
 
-const RECORDS: BinExtras = BinExtras { records: true, color_max: false };
+const RECORDS: BinExtras = BinExtras { records: true, color_max: true };
 
 fn slices(cloud: &GaussianCloud) -> GaussianSlices<'_> {
     GaussianSlices {
@@ -93,6 +95,12 @@ fn passes(c: &mut Criterion) {
     }
 }
 
+/// Limits from 0.005 to 0.03, smooth like real ones.
+fn table() -> TerminationLut {
+    let values = (0..512).map(|i| 0.005 + 0.001 * (i / 64 + 2 * (i / 8 % 8) + i % 8) as f32).collect();
+    TerminationLut::new(8, values, ColorSpace::Srgb).expect("the table is legal")
+}
+
 /// Rasterisers per lane-pixel on one thread, at every SIMD level.
 fn lane_pixels(c: &mut Criterion) {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("one thread is always to be had");
@@ -107,6 +115,11 @@ fn lane_pixels(c: &mut Criterion) {
         force_level(Some(level));
         group.bench_function(BenchmarkId::new("forward", format!("{level:?}")), |b| {
             b.iter(|| pool.install(|| rasterize(splats.rows(), black_box(&lists), &OPTIONS, StatsLevel::None, true)));
+        });
+        // The same list with a table whose limits are of the size of real ones.
+        let options = RasterOptions { t_stop: T_FLOOR, lut: Some(table()), ..OPTIONS };
+        group.bench_function(BenchmarkId::new("forward with table", format!("{level:?}")), |b| {
+            b.iter(|| pool.install(|| rasterize(splats.rows(), black_box(&lists), &options, StatsLevel::None, true)));
         });
         group.bench_function(BenchmarkId::new("backward", format!("{level:?}")), |b| {
             b.iter(|| {

@@ -23,8 +23,8 @@ pub struct RenderStats {
     pub num_pairs: u64,
     /// Pairs worked through before their tile had stopped.
     pub num_pairs_used: u64,
-    /// Lane-pixels computed: on a CPU 16 for every tile row a pair visits; on a GPU, where a unit is a pixel, 256 for every
-    /// pair in use.
+    /// Lane-pixels computed: on a CPU 16 for every tile row that a pair visits, which leaves out rows whose pixels have all
+    /// stopped; on a GPU, where a unit is a pixel, 256 for every pair in use.
     pub num_lane_pixels: u64,
     /// Pixels blended, over all pairs; filled by [`crate::StatsMode::All`] only.
     pub num_blended: u64,
@@ -44,8 +44,8 @@ impl RenderStats {
     }
 }
 
-/// Work and worth of each Gaussian in one view, `[N]` each, and work of each tile; empty where the [`crate::StatsMode`] does
-/// not fill it.
+/// Work and worth of each Gaussian in one view, `[N]` each, and work of each tile and pixel; empty where the
+/// [`crate::StatsMode`] does not fill it.
 ///
 /// A tile's list is walked front to back until its last pixel has stopped, at position E; a pixel blends an entry iff
 /// α ≥ 1/255 and T(1−α) is above the stopping transmittance. All counters are integers or maxima, so they do not depend
@@ -64,6 +64,8 @@ pub struct SplatStats {
     pub weight_sum: Vec<u64>,
     /// Tiles in which it is blended in at least one pixel.
     pub tiles_blended: Vec<u32>,
+    /// Gaussians blended in each pixel, `[H·W]`; with [`crate::StatsMode::All`].
+    pub blends_of_pixels: Vec<u32>,
     /// Lengths and ends of the tiles' lists; filled from [`crate::StatsMode::Tiles`] on.
     pub tiles: TileStats,
 }

@@ -56,7 +56,7 @@ pub struct TerminationLut {
     limits: Arc<[f32]>,
     /// The largest of `limits`: above it no colour stops, and the table is not looked at.
     largest_limit: f32,
-    /// For each cell the largest limit of the cells up to `ahead` farther along every axis.
+    /// For each set of axes and each cell the largest limit of the cells up to `ahead` farther along them.
     limits_ahead: Arc<[f32]>,
     ahead: usize,
     gamma: f32,
@@ -68,6 +68,9 @@ pub struct TerminationLut {
 
 /// Largest number of cells along each axis: indices of entries stay exact in f32.
 pub const MAX_LUT_SIZE: usize = 256;
+
+/// Largest number of cells along each axis for which [`TerminationLut::limits_ahead`] is made: its indices stay exact too.
+const MAX_SIZE_AHEAD: usize = 64;
 
 /// The largest value below 1: a channel is clamped to it, so that 1 falls into the last cell.
 pub const BELOW_ONE: f32 = 1.0 - f32::EPSILON / 2.0;
@@ -132,7 +135,10 @@ impl TerminationLut {
         // Colours only grow while a pixel composites, and by no more than what is left of it: from where a table is first
         // looked at, by its largest limit.
         self.ahead = ((self.size as f32 * self.largest_limit) as usize + 1).min(self.size);
-        self.limits_ahead = largest_ahead(&self.limits, self.size, self.ahead).into();
+        self.limits_ahead = match self.size <= MAX_SIZE_AHEAD {
+            true => (0..8).flat_map(|axes| largest_ahead(&self.limits, self.size, self.ahead, axes)).collect(),
+            false => Arc::from([]),
+        };
         Ok(self)
     }
 
@@ -195,8 +201,14 @@ impl TerminationLut {
         self.largest_limit
     }
 
-    /// For each cell the largest limit of the cells that are up to [`TerminationLut::ahead`] farther along every axis: what
-    /// a colour of the cell can ever be compared with, `[size³]`.
+    /// The smallest of [`TerminationLut::limits`].
+    pub fn smallest_limit(&self) -> f32 {
+        self.limits.iter().copied().fold(f32::INFINITY, f32::min)
+    }
+
+    /// For each set of axes, red 4, green 2, blue 1, and each cell the largest limit of the cells that are up to
+    /// [`TerminationLut::ahead`] farther along these axes: what a colour of the cell can ever be compared with if it can
+    /// leave the cell along them only. `[8 · size³]`; empty for more than 64 cells per axis.
     pub fn limits_ahead(&self) -> &[f32] {
         &self.limits_ahead
     }
@@ -238,10 +250,13 @@ impl TerminationLut {
     }
 }
 
-/// For each cell the largest value of those up to `ahead` farther along every axis.
-fn largest_ahead(values: &[f32], size: usize, ahead: usize) -> Vec<f32> {
+/// For each cell the largest value of those up to `ahead` farther along `axes`: red 4, green 2, blue 1.
+fn largest_ahead(values: &[f32], size: usize, ahead: usize, axes: usize) -> Vec<f32> {
     let mut largest = values.to_vec();
-    for stride in [1, size, size * size] {
+    for (axis, stride) in [(1, 1), (2, size), (4, size * size)] {
+        if axes & axis == 0 {
+            continue;
+        }
         // Ascending, so that what lies ahead has not been replaced yet.
         for i in 0..largest.len() {
             let cell = i / stride % size;
@@ -340,15 +355,19 @@ mod tests {
             let lut = TerminationLut::new(size, values.clone(), ColorSpace::Srgb).and_then(|lut| lut.with_gamma(gamma));
             let lut = lut.expect("legal");
             assert_eq!(lut.ahead(), ahead);
-            for i in 0..64 {
-                let cell = [i / 16, i / 4 % 4, i % 4];
+            for i in 0..8 * 64 {
+                let (axes, at) = (i / 64, i % 64);
+                let cell = [at / 16, at / 4 % 4, at % 4];
                 let block = (0..64).filter(|j| {
                     let other = [j / 16, j / 4 % 4, j % 4];
-                    (0..3).all(|c| (cell[c]..=cell[c] + ahead).contains(&other[c]))
+                    let reach = |c: usize| if axes >> (2 - c) & 1 == 1 { ahead } else { 0 };
+                    (0..3).all(|c| (cell[c]..=cell[c] + reach(c)).contains(&other[c]))
                 });
                 assert_eq!(lut.limits_ahead()[i], block.map(|j| lut.limits()[j]).fold(0.0, f32::max), "{i}");
             }
         }
+        let lut = TerminationLut::new(65, vec![0.1; 65 * 65 * 65], ColorSpace::Srgb).expect("legal");
+        assert!(lut.limits_ahead().is_empty());
     }
 
     #[test]

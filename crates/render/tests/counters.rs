@@ -178,6 +178,28 @@ fn modes_fill_what_they_say() {
         dominance.pixels_blended.is_empty() && dominance.weight_sum.is_empty() && dominance.tiles_blended.is_empty()
     );
     assert_eq!([all.pixels_blended.len(), all.weight_sum.len(), all.tiles_blended.len()], [n; 3]);
+    assert!(dominance.blends_of_pixels.is_empty());
+    let size = &scene.camera.intrinsics;
+    assert_eq!(all.blends_of_pixels.len(), size.width as usize * size.height as usize);
+}
+
+/// What pixels count is what Gaussians count, and off fragile pixels what the float64 reference counts.
+#[test]
+fn blends_of_pixels_are_those_of_the_reference() {
+    for seed in 0..6 {
+        let mut scene = random(300 + seed, Draw { n: 150, size: [45, 37], opacity: [0.05, 0.9], ..Draw::default() });
+        scene.options.stats = StatsMode::All;
+        let (frame, found) = counted(&scene);
+        assert_eq!(found.blends_of_pixels.iter().map(|&n| u64::from(n)).sum::<u64>(), frame.stats.num_blended);
+        let reference = scene.reference();
+        let pixels = found.blends_of_pixels.iter().zip(&reference.num_blended).zip(&reference.fragile);
+        let mut compared = 0;
+        for (i, ((found, expected), _)) in pixels.enumerate().filter(|(_, (_, fragile))| !**fragile) {
+            assert_eq!(found, expected, "seed {seed}, pixel {i}");
+            compared += 1;
+        }
+        assert!(compared * 2 > reference.fragile.len(), "seed {seed}: {compared} pixels compared");
+    }
 }
 
 #[test]
@@ -310,6 +332,7 @@ crate::common::on_gpu!(
     totals_of_the_frame_equal_the_reference,
     pairs_are_those_whose_alpha_reaches_the_cut_at_pixel_centres,
     modes_fill_what_they_say,
+    blends_of_pixels_are_those_of_the_reference,
     training_counts_what_inference_counts,
     counting_needs_no_image_and_leaves_it_alone,
     counting_for_gradients_is_refused,

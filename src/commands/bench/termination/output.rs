@@ -2,7 +2,8 @@
 
 use super::super::super::device::ComputeDevice;
 use super::super::super::vector_instructions;
-use super::Row;
+use super::stops::Stops;
+use super::{Row, THRESHOLDS};
 use crate::diagnostics::Result;
 use crate::report::pictures::heat;
 use crate::report::plots::Curve;
@@ -18,8 +19,10 @@ pub(super) struct Maps {
     pub height: u32,
     /// ΔE₀₀.
     pub delta_e: Vec<f32>,
-    /// Transmittance left, in parts of the largest limit.
-    pub left: Vec<f32>,
+    /// FLIP.
+    pub flip: Vec<f32>,
+    /// Part of the blends of the fixed rule that is saved.
+    pub saved: Vec<f32>,
 }
 
 /// Everything that is written.
@@ -27,9 +30,9 @@ pub(super) struct Results<'a> {
     pub model: &'a Path,
     pub device: &'a ComputeDevice,
     pub views: &'a [View],
+    pub pixels_per_degree: f64,
     pub rows: &'a [Row],
-    /// Limits of the centred residual over those of the dropped one, mean over the pixels that stopped.
-    pub ratio: f64,
+    pub stops: &'a Stops,
     pub maps: Maps,
 }
 
@@ -44,11 +47,15 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
         "threads": rayon::current_num_threads(),
         "vector_instructions": vector_instructions(),
         "views": views,
-        "centred_over_dropped_limit": results.ratio,
+        "pixels_per_degree": results.pixels_per_degree,
+        "delta_e_thresholds": THRESHOLDS,
+        "stops_of_strict": results.stops,
+        "not_measured": ["LPIPS: it needs weights, and this program reads none"],
         "rows": results.rows,
     });
     write_text(&dir.join("termination.json"), &format!("{}\n", to_json(&report)))?;
     let over_time = |r: &Row| Some((r.ms, r.delta_e_p999));
+    let flip_over_time = |r: &Row| Some((r.ms, r.flip));
     let over_gamma = |r: &Row| Some((f64::from(r.gamma?), r.psnr));
     for (file, title, x, y, value) in [
         (
@@ -57,6 +64,13 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
             "ms per frame",
             "ΔE₀₀, 99.9th percentile",
             &over_time as &dyn Fn(&Row) -> Option<(f64, f64)>,
+        ),
+        (
+            "flip_over_time.svg",
+            "Difference that is seen in the full image",
+            "ms per frame",
+            "FLIP, mean",
+            &flip_over_time,
         ),
         ("quality_over_gamma.svg", "Quality against the photographs", "γ", "PSNR, dB", &over_gamma),
     ] {
@@ -74,9 +88,10 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
             write_text(&dir.join(file), &svg)?;
         }
     }
-    let Maps { width, height, delta_e, left } = &results.maps;
-    for (file, values) in [("delta_e.png", delta_e), ("left.png", left)] {
-        let data = values.iter().flat_map(|&v| heat(v)).collect();
+    let Maps { width, height, delta_e, flip, saved } = &results.maps;
+    for (file, values, brightest) in [("delta_e.png", delta_e, 1.0), ("flip.png", flip, 0.1), ("saved.png", saved, 1.0)]
+    {
+        let data = values.iter().flat_map(|&v| heat(v / brightest)).collect();
         io::save_png(dir.join(file), &RgbImage8 { width: *width, height: *height, data })?;
     }
     Ok(())
@@ -84,24 +99,26 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
 
 /// The rows as comma-separated values.
 fn csv(rows: &[Row]) -> String {
-    let mut text =
-        "rule,gamma,psnr,ssim,psnr_to_full,delta_e_max,delta_e_p999,above_one,blends_per_pixel,ms,speed_up\n"
-            .to_owned();
+    type Column = (&'static str, fn(&Row) -> f64);
+    let columns: [Column; 12] = [
+        ("psnr", |r| r.psnr),
+        ("ssim", |r| r.ssim),
+        ("psnr_to_full", |r| r.psnr_to_full),
+        ("delta_e_max", |r| r.delta_e_max),
+        ("delta_e_p999", |r| r.delta_e_p999),
+        ("above_one", |r| r.above_one),
+        ("flip", |r| r.flip),
+        ("flip_p999", |r| r.flip_p999),
+        ("blends_per_pixel", |r| r.blends_per_pixel),
+        ("lane_pixels_per_pixel", |r| r.lane_pixels_per_pixel),
+        ("ms", |r| r.ms),
+        ("speed_up", |r| r.speed_up),
+    ];
+    let mut text = format!("rule,gamma,{}\n", columns.map(|c| c.0).join(","));
     for r in rows {
         let gamma = r.gamma.map_or_else(String::new, |g| g.to_string());
-        text.push_str(&format!(
-            "\"{}\",{gamma},{},{},{},{},{},{},{},{},{}\n",
-            r.rule,
-            r.psnr,
-            r.ssim,
-            r.psnr_to_full,
-            r.delta_e_max,
-            r.delta_e_p999,
-            r.above_one,
-            r.blends_per_pixel,
-            r.ms,
-            r.speed_up
-        ));
+        let values = columns.map(|(_, value)| value(r).to_string()).join(",");
+        text.push_str(&format!("\"{}\",{gamma},{values}\n", r.rule));
     }
     text
 }
@@ -110,14 +127,24 @@ fn csv(rows: &[Row]) -> String {
 pub(super) fn table(rows: &[Row]) -> String {
     let width = rows.iter().map(|r| r.rule.chars().count()).max().unwrap_or(0);
     let mut lines = vec![format!(
-        "{:width$}  {:>6}  {:>6}  {:>6}  {:>7}  {:>7}  {:>7}  {:>7}  {:>8}  {:>8}",
-        "rule", "γ", "PSNR", "SSIM", "to full", "ΔE max", "ΔE 99.9", "blends", "ms", "speed-up"
+        "{:width$}  {:>6}  {:>6}  {:>6}  {:>7}  {:>7}  {:>7}  {:>7}  {:>7}  {:>7}  {:>8}  {:>8}",
+        "rule", "γ", "PSNR", "SSIM", "to full", "ΔE max", "ΔE 99.9", "FLIP", "blends", "lanes", "ms", "speed-up"
     )];
     for r in rows {
         let gamma = r.gamma.map_or_else(String::new, |g| format!("{g:.3}"));
         lines.push(format!(
-            "{:width$}  {gamma:>6}  {:>6.2}  {:>6.4}  {:>7.2}  {:>7.3}  {:>7.3}  {:>7.2}  {:>8.2}  {:>7.3}×",
-            r.rule, r.psnr, r.ssim, r.psnr_to_full, r.delta_e_max, r.delta_e_p999, r.blends_per_pixel, r.ms, r.speed_up
+            "{:width$}  {gamma:>6}  {:>6.2}  {:>6.4}  {:>7.2}  {:>7.3}  {:>7.3}  {:>7.5}  {:>7.2}  {:>7.1}  {:>8.2}  {:>7.3}×",
+            r.rule,
+            r.psnr,
+            r.ssim,
+            r.psnr_to_full,
+            r.delta_e_max,
+            r.delta_e_p999,
+            r.flip,
+            r.blends_per_pixel,
+            r.lane_pixels_per_pixel,
+            r.ms,
+            r.speed_up
         ));
     }
     lines.join("\n")

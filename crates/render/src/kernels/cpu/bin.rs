@@ -63,7 +63,7 @@ pub struct TileLists<'a> {
     pub record_offsets: Cow<'a, [u32]>,
     /// Position of each record in the pair arrays, `[P]`: a permutation of 0..P. Empty unless asked for.
     pub record_pairs: Cow<'a, [u32]>,
-    /// Largest colour channel of each tile's splats, at least 0, `[tiles]`. Empty unless asked for.
+    /// Largest colour channel of each tile's splats where it exceeds 1, else 0, `[tiles]`. Empty unless asked for.
     pub color_max: Cow<'a, [f32]>,
     /// Pairs a test of bounding boxes would give.
     pub num_pairs_box: u64,
@@ -221,6 +221,12 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, extras: BinExtras) -> Resul
     // Rows of tiles write interleaved records, each exactly once: atomics keep that safe and cost a plain store.
     let record_pairs: Vec<AtomicU32> =
         (0..if extras.records { num_pairs } else { 0 }).map(|_| AtomicU32::new(0)).collect();
+    let is_bright: Vec<bool> = match extras.color_max {
+        true => {
+            rows.par_iter().with_min_len(CHUNK).map(|s| s[lane::RED..lane::RED + 3].iter().any(|&c| c > 1.0)).collect()
+        }
+        false => Vec::new(),
+    };
     let mut color_max = vec![0.0f32; if extras.color_max { grid.len() } else { 0 }];
     let maxima = split_at_offsets(
         &mut color_max,
@@ -231,7 +237,8 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, extras: BinExtras) -> Resul
         let mut cursors = starts.to_vec();
         for &e in list.iter() {
             let entry = entries[e as usize];
-            if extras.color_max {
+            // Most splats stay below 1: their lanes, which are far apart in memory, are not read.
+            if extras.color_max && is_bright[entry.splat as usize] {
                 let largest = rows[entry.splat as usize][lane::RED..lane::RED + 3].iter().copied().fold(0.0, f32::max);
                 for maximum in &mut maxima[entry.first_tile as usize..entry.end_tile.max(entry.first_tile) as usize] {
                     *maximum = maximum.max(largest);

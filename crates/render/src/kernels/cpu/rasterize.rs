@@ -3,7 +3,8 @@
 //! One task per row of tiles; per tile, splats are staged in batches and each visits the rows its ellipse reaches,
 //! sixteen pixels at a time. The state of the 256 pixels stays in the first-level cache. A pixel that has stopped
 //! keeps its transmittance with the sign flipped: the test "T(1−α) > T_stop" then fails for every later splat without
-//! a mask. A tile ends when all its pixels have stopped. Empty lists give the background.
+//! a mask. A tile ends when all its pixels have stopped, a row of one is left out from the next look on, eight splats later at
+//! most. Empty lists give the background.
 //!
 //! With a termination table a pixel also stops before a splat when its colour allows it (JND Sec. 3). The table is looked
 //! at for rows only in which some pixel has come within reach of its largest entry.
@@ -11,7 +12,7 @@
 //! A few lines over the aim: image, counters and table are one loop with options at compile time, not three copies.
 
 use super::bin::TileLists;
-use super::lut::{TileLut, below_limit, residual, tile_lut};
+use super::lut::{Line, TileLut, clear_or_stop, needs_fixed, residual, tile_lut};
 use super::stats::{PairStats, StatsLevel};
 use super::tile::{BATCH, CENTERS, RasterSplat, Row, RowI, Staged, TileRect, raster_splats, stage};
 use crate::layout::{TILE, lane};
@@ -59,6 +60,8 @@ pub struct Raster<'a> {
     pub tile_ends: Cow<'a, [u32]>,
     /// Counters of each pair, in list order, `[P]`; empty unless asked for.
     pub pair_stats: Vec<PairStats>,
+    /// Splats blended in each pixel, `[H, W]`; empty unless all counters are asked for.
+    pub blends: Vec<u32>,
     /// Per-tile counters, summed.
     pub stats: RenderStats,
 }
@@ -68,7 +71,7 @@ pub struct Raster<'a> {
 struct PixelRow {
     /// Transmittance; negative once the pixel has stopped.
     t: Row,
-    /// R, G, B, Σ T α z.
+    /// R, G, B, Σ T α z; a pass for all counters has no depth and keeps the number of blended splats in its place.
     channels: [Row; 4],
     /// List position of the stop.
     stop: RowI,
@@ -99,6 +102,8 @@ pub fn rasterize(
     let mut image = vec![0.0; width * height * channels];
     let (mut final_t, mut stop) = (vec![0.0; num_kept], vec![0; num_kept]);
     let mut tile_ends = vec![0; lists.grid.len()];
+    let counts_blends = level == StatsLevel::All;
+    let mut blends = vec![0; if counts_blends { width * height } else { 0 }];
     let splats = &raster_splats(splats);
     let mut tile_stats = vec![Vec::new(); lists.grid.tiles_y as usize];
     // A missing plane is cut into empty strips, so that all planes zip.
@@ -108,25 +113,30 @@ pub fn rasterize(
         .zip(strips_of(&mut image, strip(channels), lists))
         .zip(strips_of(&mut final_t, strip(usize::from(keep)), lists))
         .zip(strips_of(&mut stop, strip(usize::from(keep)), lists))
+        .zip(strips_of(&mut blends, strip(usize::from(counts_blends)), lists))
         .zip(tile_ends.par_chunks_mut(lists.grid.tiles_x as usize))
         .zip(tile_stats.par_iter_mut())
-        .map(|(((((tile_y, image), final_t), stop), tile_ends), pair_stats)| {
-            let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats };
-            if options.lut.is_some() {
-                return match (level, options.depth) {
-                    (StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, true>(strip)),
-                    (StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, true>(strip)),
-                    (StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, true>(strip)),
-                    (StatsLevel::None, true) => dispatch(ForwardStrip::<true, 0, false, true>(strip)),
+        .map(|((((((tile_y, image), final_t), stop), blends), tile_ends), pair_stats)| {
+            let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, blends, tile_ends, pair_stats };
+            if let Some(lut) = &options.lut {
+                return match (needs_fixed(lut, options.t_stop), level, options.depth) {
+                    (false, StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, LUT_ALONE>(strip)),
+                    (false, StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, LUT_ALONE>(strip)),
+                    (false, StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, LUT_ALONE>(strip)),
+                    (false, StatsLevel::None, true) => dispatch(ForwardStrip::<true, 0, false, LUT_ALONE>(strip)),
+                    (true, StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, LUT_AND_FIXED>(strip)),
+                    (true, StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, LUT_AND_FIXED>(strip)),
+                    (true, StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, LUT_AND_FIXED>(strip)),
+                    (true, StatsLevel::None, true) => dispatch(ForwardStrip::<true, 0, false, LUT_AND_FIXED>(strip)),
                 };
             }
             match (level, options.depth, options.smooth_cutoff) {
-                (StatsLevel::Dominance, ..) => dispatch(ForwardStrip::<false, 1, false, false>(strip)),
-                (StatsLevel::All, ..) => dispatch(ForwardStrip::<false, 2, false, false>(strip)),
-                (StatsLevel::None, false, false) => dispatch(ForwardStrip::<false, 0, false, false>(strip)),
-                (StatsLevel::None, true, false) => dispatch(ForwardStrip::<true, 0, false, false>(strip)),
-                (StatsLevel::None, false, true) => dispatch(ForwardStrip::<false, 0, true, false>(strip)),
-                (StatsLevel::None, true, true) => dispatch(ForwardStrip::<true, 0, true, false>(strip)),
+                (StatsLevel::Dominance, ..) => dispatch(ForwardStrip::<false, 1, false, NO_LUT>(strip)),
+                (StatsLevel::All, ..) => dispatch(ForwardStrip::<false, 2, false, NO_LUT>(strip)),
+                (StatsLevel::None, false, false) => dispatch(ForwardStrip::<false, 0, false, NO_LUT>(strip)),
+                (StatsLevel::None, true, false) => dispatch(ForwardStrip::<true, 0, false, NO_LUT>(strip)),
+                (StatsLevel::None, false, true) => dispatch(ForwardStrip::<false, 0, true, NO_LUT>(strip)),
+                (StatsLevel::None, true, true) => dispatch(ForwardStrip::<true, 0, true, NO_LUT>(strip)),
             }
         })
         .collect::<Vec<RenderStats>>();
@@ -140,6 +150,7 @@ pub fn rasterize(
         stop: stop.into(),
         tile_ends: tile_ends.into(),
         pair_stats: tile_stats.into_iter().flatten().collect(),
+        blends,
         stats,
     }
 }
@@ -164,22 +175,30 @@ struct Strip<'a> {
     image: &'a mut [f32],
     final_t: &'a mut [f32],
     stop: &'a mut [i32],
+    blends: &'a mut [u32],
     tile_ends: &'a mut [u32],
     pair_stats: &'a mut Vec<PairStats>,
 }
 
-/// The forward kernel. `STATS`: 0 = image, 1 = dominance counters, 2 = all counters; counters replace the image. `LUT`:
-/// with a termination table.
-struct ForwardStrip<'a, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool>(Strip<'a>);
+/// Without a termination table.
+const NO_LUT: u8 = 0;
+/// With a termination table beside the fixed rule.
+const LUT_AND_FIXED: u8 = 1;
+/// With a termination table and nothing else: one comparison less, and a stop is looked for where the table was asked.
+const LUT_ALONE: u8 = 2;
 
-impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Kernel
+/// The forward kernel. `STATS`: 0 = image, 1 = dominance counters, 2 = all counters; counters replace the image. `LUT`:
+/// [`NO_LUT`], [`LUT_AND_FIXED`] or [`LUT_ALONE`].
+struct ForwardStrip<'a, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8>(Strip<'a>);
+
+impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8> Kernel
     for ForwardStrip<'_, DEPTH, STATS, SMOOTH, LUT>
 {
     type Output = RenderStats;
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> RenderStats {
-        let Strip { splats, lists, options, tile_y, image, final_t, stop, tile_ends, pair_stats } = self.0;
+        let Strip { splats, lists, options, tile_y, image, final_t, stop, blends, tile_ends, pair_stats } = self.0;
         let (width, height) = (lists.grid.width as usize, lists.grid.height as usize);
         let mut stats = RenderStats::default();
         let mut staged = [Staged::default(); BATCH];
@@ -201,7 +220,7 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
             if STATS > 0 {
                 pair_stats.resize(first_pair + list.len(), PairStats::default());
             }
-            let mut alive = true;
+            let mut alive = rows_alive(s, &rows[..tile.height]);
             for (batch, indices) in list.chunks(BATCH).enumerate() {
                 stage(splats, indices, &tile, &mut staged);
                 for (part, chunk) in staged[..indices.len()].chunks(CHECK).enumerate() {
@@ -216,21 +235,22 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
                             options,
                             lut,
                             &mut lines,
+                            alive,
                             counters,
                         );
                         stats.num_lane_pixels += (num_rows * LANES) as u64;
                     }
-                    alive = any_alive(s, &rows[..tile.height]);
-                    if !alive {
+                    alive = rows_alive(s, &rows[..tile.height]);
+                    if alive == 0 {
                         break;
                     }
                 }
-                if !alive {
+                if alive == 0 {
                     break;
                 }
             }
             // E: where the last pixel stopped; entries before it were worked through, those after it changed nothing.
-            let end = if alive { list.len() } else { last_stop(&rows, &tile) };
+            let end = if alive != 0 { list.len() } else { last_stop(&rows, &tile) };
             stats.num_pairs_used += end as u64;
             *tile_end = end as u32;
             if STATS > 0 {
@@ -241,6 +261,10 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
                 );
                 if STATS == 2 {
                     stats.num_blended += counters.iter().map(|c| u64::from(c.pixels_blended)).sum::<u64>();
+                    for (y, row) in rows[..tile.height].iter().enumerate() {
+                        let counts = &mut blends[y * width + tile.x0..][..tile.width];
+                        counts.iter_mut().zip(&row.channels[3].0).for_each(|(to, &count)| *to = count as u32);
+                    }
                 }
             } else {
                 write_colors::<S, DEPTH, LUT>(s, &rows, &tile, width, options, lut, image);
@@ -259,21 +283,25 @@ impl<const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool> Ke
     }
 }
 
-/// Blends one splat into the rows it reaches. Returns the number of rows visited.
+/// Blends one splat into the rows it reaches and in which some pixel is `alive`, as bits. Returns the number of rows visited.
 #[expect(clippy::too_many_arguments, reason = "the state of the loop, passed in registers")]
 #[inline(always)]
-fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: bool>(
+fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, const LUT: u8>(
     s: S,
     g: &Staged,
     index: i32,
     rows: &mut [PixelRow; TILE],
     options: &RasterOptions,
     lut: TileLut<'_>,
-    lines: &mut [Row; TILE],
+    lines: &mut [Line; TILE],
+    alive: u32,
     counters: Option<&mut PairStats>,
 ) -> usize {
-    let (first, end) = (g.first_row as usize, (g.end_row as usize).min(TILE));
-    if first >= end {
+    // Rows whose pixels have all stopped are left out.
+    let reached = (1u32 << g.end_row.min(TILE as u32)).wrapping_sub(1u32 << g.first_row.min(TILE as u32));
+    let mut open = if g.first_row < g.end_row { reached & alive } else { 0 };
+    let num_rows = open.count_ones() as usize;
+    if open == 0 {
         return 0;
     }
     // log2 α = yy dy² + xy dx dy + (xx dx² + log2 o)
@@ -287,8 +315,10 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
     let t_stop = s.splat(options.t_stop);
     let (zero, position) = (s.splat(0.0), s.splat_i(index));
     let (mut num_blended, mut weight_max, mut weight_sum) = (0, s.splat(0.0), s.splat(0.0));
-    let mut y = first;
-    for (row, center) in rows[first..end].iter_mut().zip(&CENTERS[first..end]) {
+    while open != 0 {
+        let y = open.trailing_zeros() as usize % TILE;
+        open &= open - 1;
+        let (row, center) = (&mut rows[y], CENTERS[y]);
         let dy = s.splat(center - g.mean_y);
         let power = s.fma(dy, s.fma(yy, dy, linear_x), quadratic_x);
         // Compared before the exponential; false for NaN.
@@ -301,18 +331,23 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
         let t = s.load(&row.t.0);
         let t_next = s.fnma(alpha, t, t);
         // Kerbl 2023, App. C: stop before the splat that would end the pixel.
-        let mut blended = s.gt_where(hit, t_next, t_stop);
-        if LUT {
-            blended = s.and_not(blended, below_limit(s, lut, hit, t, &row.channels, &mut lines[y]));
-            y += 1;
+        let (blended, now);
+        if LUT == LUT_ALONE {
+            (blended, now) = clear_or_stop(s, lut, hit, t, &row.channels, &mut lines[y]);
+        } else {
+            let mut ahead = s.gt_where(hit, t_next, t_stop);
+            if LUT == LUT_AND_FIXED {
+                ahead = s.and_not(ahead, clear_or_stop(s, lut, hit, t, &row.channels, &mut lines[y]).1);
+            }
+            blended = ahead;
+            now = s.gt_where(s.and_not(hit, blended), t, zero);
         }
         let weight = s.mul_where(blended, alpha, t);
         // No branch: in a dense tile some pixel stops at almost every splat.
-        let now = s.gt_where(s.and_not(hit, blended), t, zero);
         let t_new = s.select(blended, t_next, t);
         s.store(s.select(now, s.neg_abs(t), t_new), &mut row.t.0);
         s.store_i(s.select_i(now, position, s.load_i(&row.stop.0)), &mut row.stop.0);
-        if STATS == 0 || LUT {
+        if STATS == 0 || LUT != NO_LUT {
             let num = if DEPTH { 4 } else { 3 };
             for (sum, channel) in row.channels[..num].iter_mut().zip(channels) {
                 s.store(s.fma(weight, channel, s.load(&sum.0)), &mut sum.0);
@@ -326,6 +361,8 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
             weight_max = s.max(weight_max, weight);
             if STATS == 2 {
                 num_blended += s.bits(blended).count_ones();
+                let count = s.load(&row.channels[3].0);
+                s.store(s.select(blended, s.add(count, s.splat(1.0)), count), &mut row.channels[3].0);
                 weight_sum = s.add(weight_sum, weight);
             }
         }
@@ -338,7 +375,7 @@ fn composite<S: Simd, const DEPTH: bool, const STATS: u8, const SMOOTH: bool, co
             counters.set_blended(num_blended, s.reduce_sum4(weight_sum, zero, zero, zero)[0]);
         }
     }
-    end - first
+    num_rows
 }
 
 /// The test-only smooth cut: α·h(u) and its derivative with respect to α, u = clamp(255 α − 1, 0, 1), h(u) = u²(3 − 2u).
@@ -354,11 +391,11 @@ pub(super) fn smooth_cutoff<S: Simd>(s: S, alpha: S::F) -> (S::F, S::F) {
 /// Splats between two looks at whether the tile has ended.
 const CHECK: usize = 8;
 
-/// Whether some pixel has not stopped.
+/// Rows in which some pixel has not stopped, as bits.
 #[inline(always)]
-fn any_alive<S: Simd>(s: S, rows: &[PixelRow]) -> bool {
-    let largest = rows.iter().fold(s.splat(-1.0), |m, row| s.max(m, s.load(&row.t.0)));
-    s.bits(s.gt(largest, s.splat(0.0))) != 0
+fn rows_alive<S: Simd>(s: S, rows: &[PixelRow]) -> u32 {
+    let is_alive = |row: &PixelRow| s.bits(s.gt(s.load(&row.t.0), s.splat(0.0))) != 0;
+    rows.iter().enumerate().map(|(y, row)| u32::from(is_alive(row)) << y).sum()
 }
 
 /// The largest stop position of the pixels inside the image.
@@ -370,7 +407,7 @@ fn last_stop(rows: &[PixelRow; TILE], tile: &TileRect) -> usize {
 
 /// Writes a tile's pixels: colour over the background, 1 − T, and depth.
 #[inline(always)]
-fn write_colors<S: Simd, const DEPTH: bool, const LUT: bool>(
+fn write_colors<S: Simd, const DEPTH: bool, const LUT: u8>(
     s: S,
     rows: &[PixelRow; TILE],
     tile: &TileRect,
@@ -388,7 +425,7 @@ fn write_colors<S: Simd, const DEPTH: bool, const LUT: bool>(
         for ((plane, channel), b) in planes.iter_mut().zip(&row.channels).zip(background) {
             let color = s.load(&channel.0);
             let mut rest = b;
-            if LUT {
+            if LUT != NO_LUT {
                 rest = s.select(s.gt(signed, s.splat(0.0)), b, residual(s, lut, t, color, b));
             }
             s.store(s.fma(t, rest, color), plane);

@@ -84,6 +84,7 @@ pub fn splat_stats(
         weight_sum: vec![0; rows(StatsMode::All)],
         tiles_blended: vec![0; rows(StatsMode::All)],
         tiles: TileStats::default(),
+        blends_of_pixels: raster.blends.clone(),
     };
     if mode >= StatsMode::Tiles {
         out.tiles = TileStats {

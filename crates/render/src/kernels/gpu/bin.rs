@@ -51,7 +51,8 @@ pub struct TileLists {
     pub tile_offsets: CubeTensor,
     /// Splat and record of each pair, `[P, 2]`.
     pub pairs: CubeTensor,
-    /// Bits of the largest colour channel of each tile's splats, at least 0, `[tiles]`. Empty unless asked for.
+    /// Bits of the largest colour channel of each tile's splats where it exceeds 1, else 0, `[tiles]`. Empty unless asked
+    /// for.
     pub color_max: CubeTensor,
     /// First record of each splat, `[V + 1]` or longer.
     pub record_offsets: CubeTensor,

@@ -73,6 +73,7 @@ pub fn splat_stats(
     tile_ends: &CubeTensor,
 ) -> Result<(SplatStats, u64)> {
     let rows = |wanted: StatsMode| if mode >= wanted { num_splats } else { 0 };
+    let num_pixels = lists.grid.width as usize * lists.grid.height as usize;
     let mut out = SplatStats {
         tiles_used: vec![0; rows(StatsMode::Tiles)],
         pixels_dominated: vec![0; rows(StatsMode::Dominance)],
@@ -81,6 +82,7 @@ pub fn splat_stats(
         weight_sum: vec![0; rows(StatsMode::All)],
         tiles_blended: vec![0; rows(StatsMode::All)],
         tiles: TileStats::default(),
+        blends_of_pixels: vec![0; if mode == StatsMode::All { num_pixels } else { 0 }],
     };
     if mode == StatsMode::None {
         return Ok((out, 0));
@@ -90,7 +92,9 @@ pub fn splat_stats(
         out.tiles = TileStats { num_pairs: none.clone(), num_pairs_used: none };
         return Ok((out, lists.grid.len() as u64));
     }
-    let counters = gpu.zeros("bytes of pair counters", &[lists.num_pairs, pair_word::COUNT], DType::U32)?;
+    // The counters of pixels stand behind those of pairs: the kernel has no binding left.
+    let num_pair_words = lists.num_pairs * pair_word::COUNT;
+    let counters = gpu.zeros("bytes of pair counters", &[num_pair_words + num_pixels], DType::U32)?;
     count_pairs::launch(
         &gpu.client,
         gpu.cubes(lists.grid.len()),
@@ -107,9 +111,22 @@ pub fn splat_stats(
         lists.color_max.clone().into_buffer_arg(),
         counters.clone().into_buffer_arg(),
         tile_args(&lists.grid, options),
+        num_pair_words as u32,
         mode >= StatsMode::Dominance,
         LutUse::of(options),
     );
+    let of_pixels = gpu.empty("bytes of pixel counters", &[out.blends_of_pixels.len()], DType::U32)?;
+    if mode == StatsMode::All {
+        copy_from::launch(
+            &gpu.client,
+            gpu.units(num_pixels),
+            cube_dim(),
+            counters.clone().into_buffer_arg(),
+            of_pixels.clone().into_buffer_arg(),
+            num_pair_words as u32,
+            num_pixels as u32,
+        );
+    }
     let per_splat = gpu.empty("bytes of splat counters", &[lists.num_visible, splat_word::COUNT], DType::U32)?;
     sum_counters::launch(
         &gpu.client,
@@ -120,9 +137,12 @@ pub fn splat_stats(
         per_splat.clone().into_buffer_arg(),
         lists.num_visible as u32,
     );
-    let [words, ids, offsets, ends] =
-        gpu.read_all_u32([&per_splat, &lists.global_from_compact, &lists.tile_offsets, tile_ends])?;
+    let [words, ids, offsets, ends, blends] =
+        gpu.read_all_u32([&per_splat, &lists.global_from_compact, &lists.tile_offsets, tile_ends, &of_pixels])?;
     out.tiles = TileStats { num_pairs: offsets.windows(2).map(|w| w[1] - w[0]).collect(), num_pairs_used: ends };
+    if mode == StatsMode::All {
+        out.blends_of_pixels = blends;
+    }
     let num_empty = offsets.windows(2).filter(|w| w[0] == w[1]).count() as u64;
     for (row, &id) in words.chunks_exact(splat_word::COUNT).zip(&ids) {
         let i = id as usize;
@@ -152,6 +172,7 @@ fn count_pairs(
     color_max: &[u32],
     counters: &[Atomic<u32>],
     args: TileArgs,
+    first_pixel: u32,
     #[comptime] pixels: bool,
     #[comptime] lut: Option<LutUse>,
 ) {
@@ -183,6 +204,7 @@ fn count_pairs(
         let mut is_done = !p.is_inside;
         let mut best = 0.0_f32;
         let mut best_at = end;
+        let mut blends = 0u32;
         for batch in 0..end.div_ceil(BATCH as u32) {
             let first = batch * BATCH as u32;
             let count = u32::min(BATCH as u32, end - first);
@@ -212,6 +234,7 @@ fn count_pairs(
                                 blue += weight * staged[8 * BATCH + slot];
                             }
                             t = t_next;
+                            blends += 1u32;
                             // The nearer wins a tie.
                             if weight > best {
                                 best = weight;
@@ -268,6 +291,17 @@ fn count_pairs(
             let record = pairs[(start + best_at) as usize * 2 + 1] as usize;
             counters[record * pair_word::COUNT + pair_word::DOMINATED].fetch_add(1u32);
         }
+        if p.is_inside {
+            counters[(first_pixel + p.index) as usize].store(blends);
+        }
+    }
+}
+
+/// Copies `len` words from `start` on.
+#[cube(launch)]
+fn copy_from(from: &[u32], to: &mut [u32], start: u32, len: u32) {
+    if ABSOLUTE_POS < len as usize {
+        to[ABSOLUTE_POS] = from[start as usize + ABSOLUTE_POS];
     }
 }
 

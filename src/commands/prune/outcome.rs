@@ -15,7 +15,7 @@ use gazesplat_core::{GaussianCloud, RgbImage8, View};
 use gazesplat_render::cluster::morton_order;
 use gazesplat_render::{RenderOptions, Splats, StatsMode, render};
 use gazesplat_train::EvalReport;
-use gazesplat_train::prune::{Basis, Outcome, Plan, Reference, Status};
+use gazesplat_train::prune::{Basis, GuardViews, Outcome, Plan, Reference, Status};
 use serde::Serialize;
 
 /// Views shown with pictures.
@@ -77,6 +77,8 @@ impl Run<'_> {
         let levels = curve::measure(&models, &views, &options, REPEATS, self.console)?;
         let (which, images) = match self.stage.dataset.test.is_empty() {
             false => (Views::Test, &self.stage.test_images),
+            // Views that are kept out judge like test views.
+            true if self.stage.split.views == GuardViews::Holdout => (Views::Test, &self.stage.guard_images),
             true => (Views::Training, &self.stage.guard_images),
         };
         let (first, last) = (&models[0], &models[models.len() - 1]);

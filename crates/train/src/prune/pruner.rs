@@ -106,6 +106,14 @@ impl Pruner {
         if job.guard_images.is_empty() {
             return Err(Error::Prune("there is no view to judge the model by".to_owned()));
         }
+        let is_counted = |name: &String| job.counted.iter().any(|(counted, _)| counted == name);
+        if let Some(view) = job.images.views().iter().find(|view| !is_counted(&view.name)) {
+            return Err(Error::Prune(format!(
+                "view `{}` trains but is not among the {} views that are counted: what only it sees would have no worth",
+                view.name,
+                job.counted.len()
+            )));
+        }
         let plan = job.config.plan();
         let is_first_reference = plan.reference > 0;
         let steps = if is_first_reference { plan.reference } else { plan.num_steps() };
@@ -279,8 +287,9 @@ impl Pruner {
     /// One step or one check.
     ///
     /// # Errors
-    /// As [`Trainer::step`]; the model and the best state are then those before the step. [`Error::Prune`] when the
-    /// reference is no number, or misses the guard itself.
+    /// As [`Trainer::step`]; the model is then that before the step. A check that fails half-way may leave a model cut short;
+    /// the best state and the last checkpoint are as they were. [`Error::Prune`] when the reference is no number, or misses
+    /// the guard itself.
     pub fn advance(&mut self) -> Result<Progress> {
         match self.phase {
             Phase::Reference if self.trainer.step_index() < self.plan.reference => self.step(),

@@ -338,6 +338,9 @@ fn what_cannot_be_pruned_is_refused_before_any_work() {
     let mut without = job(&config, &SCENE.cloud, &device);
     without.images = images(&[]);
     assert!(refused(&without).contains("no training views"));
+    let mut without = job(&config, &SCENE.cloud, &device);
+    without.counted.remove(2);
+    assert!(refused(&without).contains("is not among the 6 views that are counted"), "{}", refused(&without));
     let mut wrong = config.clone();
     wrong.prune.event_every = 0;
     assert!(refused(&job(&wrong, &SCENE.cloud, &device)).starts_with("prune.event_every"));

@@ -96,10 +96,8 @@ pub(super) fn read(path: &Path, bytes: &[u8], header: &Header) -> Result<(Gaussi
         cloud.log_scales[index] = lerp(bound(2), bound(3), unpacked_vector(word(row, scale)));
         cloud.quats[index] = unpacked_rotation(word(row, rotation));
         let [r, g, b, opacity] = word(row, color).to_be_bytes();
-        let mut rgb = [r, g, b].map(|level| f32::from(level) / 255.0);
-        if num_bounds == 6 {
-            rgb = lerp(bound(4), bound(5), rgb);
-        }
+        let share = [r, g, b].map(|level| f64::from(level) / 255.0);
+        let rgb = if num_bounds == 6 { lerp(bound(4), bound(5), share) } else { share.map(|v| v as f32) };
         cloud.sh[index * k] = rgb.map(dc_from_color);
         cloud.opacity_logits[index] = logit_from_u8(opacity);
         if let Some(table) = rest_table {
@@ -215,16 +213,20 @@ fn relative(low: [f32; 3], high: [f32; 3], values: [f32; 3]) -> [f64; 3] {
     })
 }
 
-fn lerp(low: [f32; 3], high: [f32; 3], t: [f32; 3]) -> [f32; 3] {
-    [0, 1, 2].map(|axis| low[axis] * (1.0 - t[axis]) + high[axis] * t[axis])
+/// In `f64`, so that what is rounded is the value alone, and not bounds that are far larger.
+fn lerp(low: [f32; 3], high: [f32; 3], t: [f64; 3]) -> [f32; 3] {
+    [0, 1, 2].map(|axis| (f64::from(low[axis]) * (1.0 - t[axis]) + f64::from(high[axis]) * t[axis]) as f32)
 }
 
 fn packed_vector(t: [f64; 3]) -> u32 {
     t.iter().zip(VECTOR_BITS).fold(0, |word, (&t, bits)| (word << bits) | level(t, bits))
 }
 
-fn unpacked_vector(word: u32) -> [f32; 3] {
-    let part = |shift: u32, bits: u32| ((word >> shift) & ((1 << bits) - 1)) as f32 / ((1 << bits) - 1) as f32;
+fn unpacked_vector(word: u32) -> [f64; 3] {
+    let part = |shift: u32, bits: u32| {
+        let top = (1 << bits) - 1;
+        f64::from((word >> shift) & top) / f64::from(top)
+    };
     [part(21, 11), part(11, 10), part(0, 11)]
 }
 

@@ -8,7 +8,7 @@ use crate::sh;
 use std::f32::consts::FRAC_1_SQRT_2;
 
 /// Colours are stored as ½ + 0.15 · DC: more than 0..1, as higher bands may bring such a colour back.
-const COLOR_SCALE: f32 = 0.15;
+const COLOR_SCALE: f64 = 0.15;
 /// Largest stored magnitude of a component of the smallest three.
 const ROTATION_STEPS: f32 = 511.0;
 /// Largest stored coordinate, in steps.
@@ -44,7 +44,7 @@ impl<'a> Packed<'a> {
             *logit = logit_from_u8(level);
         }
         for (row, rgb) in cloud.sh.chunks_exact_mut(k).zip(colors.chunks_exact(3)) {
-            row[0] = [rgb[0], rgb[1], rgb[2]].map(|level| (f32::from(level) / 255.0 - 0.5) / COLOR_SCALE);
+            row[0] = [rgb[0], rgb[1], rgb[2]].map(|level| ((f64::from(level) / 255.0 - 0.5) / COLOR_SCALE) as f32);
         }
         if k > 1 {
             for (row, bytes) in cloud.sh.chunks_exact_mut(k).zip(rest.chunks_exact(3 * (k - 1))) {
@@ -106,7 +106,8 @@ pub(super) fn fractional_bits(cloud: &GaussianCloud) -> Result<u32> {
 pub(super) fn pack(cloud: &GaussianCloud, fractional_bits: u32, sh_bits: [u32; 2]) -> ([Vec<u8>; 6], usize) {
     let n = cloud.len();
     let mut num_clamped = 0;
-    let mut to_u8 = |value: f32| {
+    // In `f64`: a value near the middle of two steps goes to the nearer one.
+    let mut to_u8 = |value: f64| {
         let rounded = (value + 0.5).floor();
         num_clamped += usize::from(!(0.0..=255.0).contains(&rounded));
         rounded.clamp(0.0, 255.0) as u8
@@ -119,8 +120,8 @@ pub(super) fn pack(cloud: &GaussianCloud, fractional_bits: u32, sh_bits: [u32; 2
     }
     let alphas = cloud.opacity_logits.iter().map(|&logit| opacity_to_u8(logit)).collect();
     let dc = (0..n).flat_map(|index| cloud.sh_of(index)[0]);
-    let colors = dc.map(|value| to_u8((value * COLOR_SCALE + 0.5) * 255.0)).collect();
-    let scales = cloud.log_scales.as_flattened().iter().map(|&log| to_u8((log + 10.0) * 16.0)).collect();
+    let colors = dc.map(|value| to_u8((f64::from(value) * COLOR_SCALE + 0.5) * 255.0)).collect();
+    let scales = cloud.log_scales.as_flattened().iter().map(|&log| to_u8((f64::from(log) + 10.0) * 16.0)).collect();
     let quats = cloud.quats.iter();
     let rotations = quats.flat_map(|&quat| packed_rotation(normalized(quat)).to_le_bytes()).collect();
     let mut rest = Vec::with_capacity(n * sh::num_rest(cloud.sh_degree));

@@ -39,7 +39,7 @@ fn decay(log_scales: &[f32], grads: &mut [f32], used: &[u32], factor: f32, num_r
 
 /// The axis of the largest of three values, the first on ties.
 #[cube]
-fn largest_axis(x: f32, y: f32, z: f32) -> u32 {
+pub fn largest_axis(x: f32, y: f32, z: f32) -> u32 {
     let mut axis = 0u32;
     let mut largest = x;
     if y > largest {

@@ -83,13 +83,15 @@ struct Row {
     speed_up: f64,
 }
 
-/// How much longer another criterion's model of the same PSNR takes.
+/// How much more another criterion's model of the same PSNR takes.
 #[derive(Debug, Clone, Serialize)]
 struct AtEqualQuality {
     criterion: String,
     psnr: f64,
     /// Its time per frame, interpolated, over that of CE.
     time_over_ce: f64,
+    /// Its intersections worked through, likewise: the same on every machine.
+    work_over_ce: f64,
 }
 
 /// Runs the study.
@@ -137,7 +139,10 @@ fn study(args: &CurveArgs, device: &ComputeDevice, console: &Console) -> Result<
     write(args, device, &rows, &levels, &equal)?;
     console.note(table(&rows));
     for e in &equal {
-        console.note(format_args!("at {:.2} dB {} takes {:.2} × the time of ce", e.psnr, e.criterion, e.time_over_ce));
+        console.note(format_args!(
+            "at {:.2} dB {} takes {:.2} × the time and {:.2} × the intersections of ce",
+            e.psnr, e.criterion, e.time_over_ce, e.work_over_ce
+        ));
     }
     console.note(format_args!("{} views; results in `{}`", views.len(), args.out.display()));
     console.json(&rows)
@@ -199,13 +204,13 @@ fn tuned(
     Ok(trainer.to_cloud()?)
 }
 
-/// For every model of CE, the time of the others at its PSNR, where their curves reach it.
+/// For every model of CE, time and work of the others at its PSNR, where their curves reach it.
 fn at_equal_quality(rows: &[Row]) -> Vec<AtEqualQuality> {
-    let of = |name: &str| {
+    let of = |name: &str, value: fn(&Level) -> f64| {
         let mut points: Vec<(f64, f64)> = rows
             .iter()
             .filter(|r| r.criterion == name || r.criterion == "dense")
-            .map(|r| (r.psnr, r.level.ms))
+            .map(|r| (r.psnr, value(&r.level)))
             .collect();
         points.sort_by(|a, b| a.0.total_cmp(&b.0));
         points
@@ -216,9 +221,11 @@ fn at_equal_quality(rows: &[Row]) -> Vec<AtEqualQuality> {
     let mut found = Vec::new();
     for ce in rows.iter().filter(|r| r.criterion == "ce") {
         for name in &others {
-            if let Some(ms) = interpolated(&of(name), ce.psnr) {
-                let time_over_ce = ms / ce.level.ms;
-                found.push(AtEqualQuality { criterion: (*name).to_owned(), psnr: ce.psnr, time_over_ce });
+            let at_ce = |value: fn(&Level) -> f64| {
+                interpolated(&of(name, value), ce.psnr).map(|found| found / value(&ce.level).max(f64::MIN_POSITIVE))
+            };
+            if let (Some(time_over_ce), Some(work_over_ce)) = (at_ce(|l| l.ms), at_ce(|l| l.pairs_used_per_tile)) {
+                found.push(AtEqualQuality { criterion: (*name).to_owned(), psnr: ce.psnr, time_over_ce, work_over_ce });
             }
         }
     }

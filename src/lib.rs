@@ -9,6 +9,7 @@ pub mod commands;
 pub mod console;
 pub mod diagnostics;
 pub mod interrupt;
+pub mod json_lines;
 pub mod progress;
 pub mod report;
 pub mod run_dir;

@@ -23,6 +23,7 @@ pub struct TrainProgress<'a> {
     console: &'a Console,
     bar: ProgressBar,
     num_steps: u32,
+    first: u32,
     window_start: (Instant, u32),
     steps_per_sec: Option<f64>,
     last_line: Instant,
@@ -35,7 +36,23 @@ impl<'a> TrainProgress<'a> {
     pub fn new(console: &'a Console, num_steps: u32) -> Self {
         let bar = bar(console, u64::from(num_steps), "{bar:28} {pos}/{len} {msg}");
         let now = Instant::now();
-        Self { console, bar, num_steps, window_start: (now, 0), steps_per_sec: None, last_line: now, loss: None }
+        Self {
+            console,
+            bar,
+            num_steps,
+            first: 0,
+            window_start: (now, 0),
+            steps_per_sec: None,
+            last_line: now,
+            loss: None,
+        }
+    }
+
+    /// Of a run that goes on after `first` steps.
+    #[must_use]
+    pub fn after(mut self, first: u32) -> Self {
+        (self.first, self.window_start) = (first, (Instant::now(), first));
+        self
     }
 
     /// Tells that `done` steps are done, `report` being of the last.
@@ -83,7 +100,7 @@ impl<'a> TrainProgress<'a> {
 impl Observer for TrainProgress<'_> {
     fn on_event(&mut self, event: &TrainEvent<'_>) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
         match event {
-            TrainEvent::Started { .. } => self.window_start = (Instant::now(), 0),
+            TrainEvent::Started { .. } => self.window_start = (Instant::now(), self.first),
             TrainEvent::Step(report) => self.step(report.step, report),
             TrainEvent::Evaluated { step, report } => {
                 self.console.note(format_args!(

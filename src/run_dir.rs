@@ -7,13 +7,15 @@
 //! | `point_cloud.ply` | the model, 3DGS layout |
 //! | `eval.json` | test-view quality |
 //! | `report.html` | all of it to look at |
+//! | `checkpoint-STEP.safetensors` | only of a run that is under way or was interrupted: what `--resume` goes on from |
 //! | `unfinished.ply` | only of a training that failed, or is under way on a GPU: its last good model |
 
 use crate::diagnostics::{Failure, Result};
+use crate::json_lines::JsonLines;
 use gazesplat_core::GaussianCloud;
 use serde::Serialize;
 use std::fs;
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// A directory that holds, or will hold, one run.
@@ -28,11 +30,15 @@ impl RunDir {
     /// Prepares `path` for a new run, and proves that it can be written before hours of work depend on it.
     ///
     /// # Errors
-    /// When `path` already holds a model and `overwrite` is false, when it is a file, or when it cannot be written.
+    /// When `path` already holds a model or a checkpoint and `overwrite` is false, when it is a file, or when it cannot be written.
     pub fn create(path: &Path, overwrite: bool) -> Result<Self> {
         if path.is_file() {
             return Err(Failure::new(format!("`{}` is a file, expected a directory", path.display()))
                 .hint("choose another directory with `--out`"));
+        }
+        if !overwrite && !checkpoints(path).is_empty() {
+            return Err(Failure::new(format!("`{}` holds an interrupted run", path.display()))
+                .hint("go on with `--resume`, or replace the run with `--overwrite`"));
         }
         if !overwrite && path.join(MODEL).exists() {
             return Err(Failure::new(format!("`{}` already holds a run", path.display()))
@@ -57,6 +63,21 @@ impl RunDir {
             }
             n += 1;
         }
+    }
+
+    /// The directory of a training that was interrupted.
+    ///
+    /// # Errors
+    /// When it holds no checkpoint, or cannot be written.
+    pub fn open_interrupted(path: &Path) -> Result<Self> {
+        if checkpoints(path).is_empty() {
+            let is_finished = path.join(MODEL).is_file();
+            let why = if is_finished { "the run in it is finished" } else { "no run left one in it" };
+            let how =
+                if is_finished { "`--init` goes on from its model" } else { "without `--resume` a new run begins" };
+            return Err(Failure::new(format!("`{}` holds no checkpoint: {why}", path.display())).hint(how));
+        }
+        Self::create(path, true)
     }
 
     /// A directory that holds a finished run.
@@ -114,7 +135,8 @@ impl RunDir {
     pub fn clear(&self) -> Result<()> {
         let unfinished = self.unfinished_path();
         let files = [self.model_path(), self.eval_path(), self.report_path(), self.metrics_path(), unfinished];
-        files.into_iter().chain([self.settings_path()]).try_for_each(|file| remove(&file))
+        let checkpoints = checkpoints(&self.path).into_iter().map(|(_, path)| path);
+        files.into_iter().chain([self.settings_path()]).chain(checkpoints).try_for_each(|file| remove(&file))
     }
 
     /// Writes `settings.toml`: the resolved settings as TOML under lines that say where they come from, and on which device the
@@ -185,10 +207,8 @@ impl RunDir {
     ///
     /// # Errors
     /// When the file cannot be created.
-    pub fn start_metrics(&self) -> Result<MetricsLog> {
-        let path = self.metrics_path();
-        let file = fs::File::create(&path).map_err(|e| cannot_write(&path, e))?;
-        Ok(MetricsLog { path, writer: BufWriter::new(file) })
+    pub fn start_metrics(&self) -> Result<JsonLines> {
+        JsonLines::create(self.metrics_path())
     }
 }
 
@@ -218,24 +238,26 @@ pub(crate) fn remove(file: &Path) -> Result<()> {
     }
 }
 
-/// The growing `metrics.jsonl`. The one file that is appended to: whole lines, flushed, so that it can be followed.
-#[derive(Debug)]
-pub struct MetricsLog {
-    path: PathBuf,
-    writer: BufWriter<fs::File>,
+/// The checkpoint of step `step` in a run directory.
+pub(crate) fn checkpoint_path(dir: &Path, step: u32) -> PathBuf {
+    dir.join(format!("{CHECKPOINT_PREFIX}{step}{CHECKPOINT_SUFFIX}"))
 }
 
-impl MetricsLog {
-    /// Appends one object as a line and flushes it.
-    ///
-    /// # Errors
-    /// When the disk refuses.
-    pub fn append(&mut self, record: &impl Serialize) -> Result<()> {
-        let mut line = serde_json::to_vec(record).expect("metrics are plain numbers and text");
-        line.push(b'\n');
-        self.writer.write_all(&line).and_then(|()| self.writer.flush()).map_err(|e| cannot_write(&self.path, e))
-    }
+/// Steps and files of the checkpoints in `dir`, the latest first.
+pub(crate) fn checkpoints(dir: &Path) -> Vec<(u32, PathBuf)> {
+    let entries = fs::read_dir(dir).into_iter().flatten().flatten();
+    let checkpoint = |entry: fs::DirEntry| {
+        let name = entry.file_name().into_string().ok()?;
+        let step = name.strip_prefix(CHECKPOINT_PREFIX)?.strip_suffix(CHECKPOINT_SUFFIX)?.parse().ok()?;
+        Some((step, entry.path()))
+    };
+    let mut found: Vec<_> = entries.filter_map(checkpoint).collect();
+    found.sort_by_key(|(step, _)| std::cmp::Reverse(*step));
+    found
 }
+
+const CHECKPOINT_PREFIX: &str = "checkpoint-";
+const CHECKPOINT_SUFFIX: &str = ".safetensors";
 
 /// Indented JSON of a value of ours.
 pub(crate) fn to_json(value: &impl Serialize) -> String {

@@ -63,6 +63,9 @@ impl Default for HvsqTerm {
     }
 }
 
+/// The term, and the cache that its statistics are kept in.
+pub type HvsqLossAndCache = (Box<dyn ImageLoss>, Arc<ReferenceCache>);
+
 impl HvsqTerm {
     /// Whether the loss has this term.
     pub fn is_used(&self) -> bool {
@@ -103,7 +106,7 @@ impl HvsqTerm {
     ///
     /// # Errors
     /// When the pools are larger than a photograph.
-    pub fn make(&self, views: &[View], device: &Device) -> Result<Option<(Box<dyn ImageLoss>, Arc<ReferenceCache>)>> {
+    pub fn make(&self, views: &[View], device: &Device) -> Result<Option<HvsqLossAndCache>> {
         if !self.is_used() {
             return Ok(None);
         }

@@ -26,7 +26,17 @@ fn run_on(device: &ComputeDevice, scene: &Path, out: &Path, overrides: &[&str]) 
     let settings = Settings::new().with_overrides(&overrides).expect("valid settings");
     let config = settings.resolve().expect("valid settings");
     let terms = settings.resolve_terms().expect("valid settings");
-    let job = TrainJob { scene, config, terms, init: None, out: Some(out), overwrite: false, device };
+    let job = TrainJob {
+        scene,
+        config,
+        terms,
+        init: None,
+        out: Some(out),
+        overwrite: false,
+        device,
+        resume: None,
+        is_resumable: true,
+    };
     train(&job, &AtomicBool::new(false), &Console::quiet()).expect("training works")
 }
 

@@ -83,7 +83,17 @@ fn demo(args: &DemoArgs, device: &ComputeDevice, console: &Console) -> Result<()
         .with_override(&format!("densify.cap={}", size.cap))?
         .resolve()?;
     let (terms, out) = (TermSection::default(), Some(args.out.as_path()));
-    let job = TrainJob { scene: &scene, config, terms, init: None, out, overwrite, device };
+    let job = TrainJob {
+        scene: &scene,
+        config,
+        terms,
+        init: None,
+        out,
+        overwrite,
+        device,
+        resume: None,
+        is_resumable: false,
+    };
     let mut trained = train(&job, stop, console)?;
 
     console.note("3/3  an orbit through the model");

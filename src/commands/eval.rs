@@ -146,6 +146,9 @@ impl<'a> From<&'a HvsqOfViews> for HvsqReport<'a> {
     }
 }
 
+/// Every view by name, with what HVSQ says of it.
+type NamedMeasures = Vec<(String, Measured)>;
+
 /// Measures every view in all ways that were asked for, keeps what was compared in `files`, and writes the map of the view
 /// that differs most in the last measure.
 fn measure(
@@ -156,7 +159,7 @@ fn measure(
     images: &ImageCache,
     options: &RenderOptions,
     console: &Console,
-) -> Result<(EvalReport, Option<Vec<(String, Measured)>>)> {
+) -> Result<(EvalReport, Option<NamedMeasures>)> {
     let mut views: Vec<(String, Measured)> = Vec::with_capacity(images.len());
     let mut worst: Option<(f64, ImageF32, LossTarget)> = None;
     let mut each = |index: usize, score: &ViewScore, image: &ImageF32| -> Result<()> {

@@ -1,12 +1,15 @@
-//! Trains on a device that can be lost, and keeps a copy of the model on the host and on the disk: what is left when the
-//! device is gone, or takes the whole process with it.
+//! Trains and keeps what is left when a run is cut off: checkpoints, and of a device that can be lost a copy of the model,
+//! on the host and on the disk.
 
 use gazesplat_core::GaussianCloud;
 use gazesplat_train::{Observer, Outcome, TrainEvent, Trainer};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use super::checkpoints::Checkpoints;
 use super::device::ComputeDevice;
+use crate::console::Console;
 use crate::diagnostics::Result;
+use crate::progress::TrainProgress;
 use crate::run_dir::RunDir;
 
 /// Copies in a run whose settings never measure the test views: as often as such a measurement is made at least.
@@ -21,61 +24,114 @@ pub(crate) struct Kept {
     pub cloud: GaussianCloud,
 }
 
-/// Trains as [`gazesplat_train::run`] does. On a GPU the model is copied into `kept` and the `unfinished.ply` of `run_dir`
-/// whenever the test views have been measured, and panics become errors; reading back changes nothing of the result. Who
-/// has saved the model removes the file.
-///
-/// # Errors
-/// As [`gazesplat_train::run`]; `kept` then holds the last copy.
-pub(crate) fn run(
-    trainer: &mut Trainer,
-    observers: &mut [&mut dyn Observer],
-    stop: &AtomicBool,
-    device: &ComputeDevice,
-    run_dir: &RunDir,
-    kept: &mut Option<Kept>,
-) -> Result<Outcome> {
-    if !device.is_gpu() {
-        return Ok(gazesplat_train::run(trainer, observers, stop)?);
+/// An observer whose files can be brought up to date between two steps.
+pub(crate) trait Follower: Observer {
+    /// Everything told so far is on the disk afterwards.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    fn catch_up(&mut self) -> Result<()> {
+        Ok(())
     }
-    device.guard(|| in_legs(trainer, observers, stop, run_dir, kept))
 }
 
-/// A run in several legs, each ended by a pause in which the model is copied.
-fn in_legs(
-    trainer: &mut Trainer,
-    observers: &mut [&mut dyn Observer],
-    stop: &AtomicBool,
-    run_dir: &RunDir,
-    kept: &mut Option<Kept>,
-) -> Result<Outcome> {
+impl Follower for TrainProgress<'_> {}
+
+/// What is kept of a run, and where.
+#[derive(Clone, Copy)]
+pub(crate) struct Keeper<'a> {
+    /// Its directory.
+    pub run_dir: &'a RunDir,
+    /// Its checkpoints, if it can be resumed.
+    pub checkpoints: Option<&'a Checkpoints>,
+    /// Where failures to write are told: they end no run.
+    pub console: &'a Console,
+}
+
+impl Keeper<'_> {
+    /// Trains as [`gazesplat_train::run`] does, with checkpoints as `train.checkpoint_every` says and when it is stopped. On a
+    /// GPU the model is also copied into `kept` and the `unfinished.ply` of the run whenever the test views have been
+    /// measured, and panics become errors. Reading back changes nothing of the result. Who has saved the model removes the
+    /// file.
+    ///
+    /// # Errors
+    /// As [`gazesplat_train::run`]; `kept` then holds the last copy.
+    pub fn run(
+        &self,
+        trainer: &mut Trainer,
+        observers: &mut [&mut dyn Follower],
+        stop: &AtomicBool,
+        device: &ComputeDevice,
+        kept: &mut Option<Kept>,
+    ) -> Result<Outcome> {
+        let copy_every = device.is_gpu().then(|| copy_interval(trainer));
+        device.guard(|| self.in_legs(trainer, observers, stop, copy_every, kept))
+    }
+
+    /// A run in several legs, each ended by a pause in which the state is read back.
+    fn in_legs(
+        &self,
+        trainer: &mut Trainer,
+        observers: &mut [&mut dyn Follower],
+        stop: &AtomicBool,
+        copy_every: Option<u32>,
+        kept: &mut Option<Kept>,
+    ) -> Result<Outcome> {
+        let every = Some(trainer.config().train.checkpoint_every);
+        let checkpoint_every = every.filter(|&every| every > 0 && self.checkpoints.is_some());
+        let pause = AtomicBool::new(false);
+        let mut relay =
+            Relay { observers, stop, pause: &pause, due: [copy_every, checkpoint_every], has_started: false };
+        loop {
+            let outcome = gazesplat_train::run(trainer, &mut [&mut relay], &pause)?;
+            if outcome == Outcome::Finished {
+                return Ok(outcome);
+            }
+            let step = trainer.step_index();
+            let is_stopped = stop.load(Ordering::Relaxed);
+            if is_stopped || is_due(checkpoint_every, step) {
+                relay.observers.iter_mut().try_for_each(|observer| observer.catch_up())?;
+                // A disk that is full now may not be at the end of the run.
+                if let Some(checkpoints) = self.checkpoints
+                    && let Err(failure) = checkpoints.save(trainer, &self.run_dir.metrics_path())
+                {
+                    self.console.warn(format_args!("no checkpoint of step {step}: {failure}"));
+                }
+            }
+            if is_stopped {
+                return Ok(outcome);
+            }
+            if is_due(copy_every, step) {
+                let copy = Kept { step, cloud: trainer.to_cloud()? };
+                // Drivers have been seen to end the process.
+                if let Err(failure) = self.run_dir.write_unfinished(&copy.cloud) {
+                    tracing::error!("no copy of step {step}: {failure}");
+                }
+                *kept = Some(copy);
+            }
+            pause.store(false, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Steps between two copies.
+fn copy_interval(trainer: &Trainer) -> u32 {
     let config = &trainer.config().train;
     let num_test = trainer.test_images().len();
     let measured = config.eval_interval(num_test).filter(|_| num_test > 0);
-    let interval = measured.unwrap_or((config.steps / COPIES_PER_RUN).max(1));
-    let pause = AtomicBool::new(false);
-    let mut relay = Relay { observers, stop, pause: &pause, interval, has_started: false };
-    loop {
-        let outcome = gazesplat_train::run(trainer, &mut [&mut relay], &pause)?;
-        if outcome == Outcome::Finished || stop.load(Ordering::Relaxed) {
-            return Ok(outcome);
-        }
-        let copy = Kept { step: trainer.step_index(), cloud: trainer.to_cloud()? };
-        // Drivers have been seen to end the process. A disk that is full today may not be at the end of the run.
-        if let Err(failure) = run_dir.write_unfinished(&copy.cloud) {
-            tracing::error!("no copy of step {}: {failure}", copy.step);
-        }
-        *kept = Some(copy);
-        pause.store(false, Ordering::Relaxed);
-    }
+    measured.unwrap_or((config.steps / COPIES_PER_RUN).max(1))
 }
 
-/// Hands events on, so that the legs look like one run, and asks for a pause when a copy is due or the run is to stop.
+fn is_due(every: Option<u32>, step: u32) -> bool {
+    every.is_some_and(|every| step.is_multiple_of(every))
+}
+
+/// Hands events on, so that the legs look like one run, and asks for a pause when something is due or the run is to stop.
 struct Relay<'a, 'b> {
-    observers: &'a mut [&'b mut dyn Observer],
+    observers: &'a mut [&'b mut dyn Follower],
     stop: &'a AtomicBool,
     pause: &'a AtomicBool,
-    interval: u32,
+    due: [Option<u32>; 2],
     has_started: bool,
 }
 
@@ -95,7 +151,7 @@ impl Observer for Relay<'_, '_> {
                 false
             }
             // The measurement of this step comes before the loop looks at the flag.
-            TrainEvent::Step(report) => report.step.is_multiple_of(self.interval),
+            TrainEvent::Step(report) => self.due.iter().any(|&every| is_due(every, report.step)),
             _ => false,
         };
         if is_due || self.stop.load(Ordering::Relaxed) {
@@ -138,6 +194,21 @@ mod tests {
             }
             if self.fails_at == Some(report.step) { Err("the device is gone".into()) } else { Ok(()) }
         }
+    }
+
+    impl Follower for Script<'_> {}
+
+    /// Trains with copies and without checkpoints, as on a GPU.
+    fn in_legs(
+        trainer: &mut Trainer,
+        observers: &mut [&mut dyn Follower],
+        stop: &AtomicBool,
+        run_dir: &RunDir,
+        kept: &mut Option<Kept>,
+    ) -> Result<Outcome> {
+        let copy_every = Some(copy_interval(trainer));
+        let keeper = Keeper { run_dir, checkpoints: None, console: &Console::quiet() };
+        keeper.in_legs(trainer, observers, stop, copy_every, kept)
     }
 
     fn trainer(dir: &std::path::Path, eval_every: u32) -> Trainer {

@@ -15,6 +15,7 @@ pub mod synth;
 pub mod termination;
 pub mod train;
 
+mod checkpoints;
 mod devices;
 mod frames;
 mod keeper;

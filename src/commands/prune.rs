@@ -100,7 +100,7 @@ pub fn command(args: &PruneArgs, console: &Console) -> Result<()> {
     let (config, terms) = resolved(args, &recorded)?;
     let stop = interrupt::stop_flag()?;
     with_threads(config.prune.threads, || {
-        device.guard(|| Run::new(args, &model, config, terms, &recorded, &device, console)?.to_end(stop))
+        device.guard(|| Run::new(args, &model, config, terms, &recorded, &device, console)?.complete(stop))
     })?
 }
 
@@ -227,7 +227,7 @@ impl<'a> Run<'a> {
     }
 
     /// Runs to the end or until `stop` is raised.
-    fn to_end(mut self, stop: &AtomicBool) -> Result<()> {
+    fn complete(mut self, stop: &AtomicBool) -> Result<()> {
         if self.dir.is_new_report() {
             self.dir.write_settings(&self.stage.train_config, &self.config, &self.terms, &self.scene, self.device)?;
             self.dir.begin_report(&self.header())?;

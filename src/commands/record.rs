@@ -1,7 +1,8 @@
 //! Keeps what happens during a training: every logged step into `metrics.jsonl`, the same for the report.
 
+use super::keeper::Follower;
+use crate::json_lines::JsonLines;
 use crate::report::StepPoint;
-use crate::run_dir::MetricsLog;
 use gazesplat_train::{EvalReport, Observer, StageMs, StepReport, TrainEvent};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -64,7 +65,7 @@ struct TestScore {
 /// The observer that remembers.
 #[derive(Debug)]
 pub(crate) struct Recorder {
-    log: MetricsLog,
+    log: JsonLines,
     log_every: u32,
     is_gpu: bool,
     /// The latest step: written when the next one comes, since its test score comes after it.
@@ -83,7 +84,7 @@ pub(crate) struct Recorder {
 
 impl Recorder {
     /// Records every `log_every`-th step into `log`; on a GPU without the times of stages.
-    pub(crate) fn new(log: MetricsLog, log_every: u32, is_gpu: bool) -> Self {
+    pub(crate) fn new(log: JsonLines, log_every: u32, is_gpu: bool) -> Self {
         Self {
             log,
             log_every,
@@ -97,6 +98,22 @@ impl Recorder {
             steps: Vec::new(),
             test_psnr: Vec::new(),
         }
+    }
+
+    /// Remembers what stands in the log of a run that goes on: loss, Gaussians and quality; times are those of this part.
+    pub(crate) fn recall(&mut self) -> crate::Result<()> {
+        let path = self.log.path();
+        let text = std::fs::read_to_string(path).map_err(|e| crate::Failure::io("read", path, e))?;
+        for line in text.lines().filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok()) {
+            let step = line["step"].as_u64().and_then(|step| u32::try_from(step).ok());
+            let (Some(step), Some(loss), Some(num)) = (step, line["loss"].as_f64(), line["num_gaussians"].as_u64())
+            else {
+                continue;
+            };
+            self.steps.push(StepPoint { step, loss: loss as f32, num_gaussians: num as usize });
+            self.test_psnr.extend(line["test"]["psnr"].as_f64().map(|psnr| (step, psnr)));
+        }
+        Ok(())
     }
 
     /// Mean milliseconds per step.
@@ -196,6 +213,13 @@ impl Observer for Recorder {
             _ => {}
         }
         Ok(())
+    }
+}
+
+impl Follower for Recorder {
+    fn catch_up(&mut self) -> crate::Result<()> {
+        self.flush()?;
+        self.log.sync()
     }
 }
 

@@ -1,7 +1,10 @@
 //! `gazesplat train`: photographs in, a model with its measured quality out.
+//!
+//! The file is long because a run is one sequence from the scene to the report, and is read as one.
 
+use super::checkpoints::{Checkpoints, Resumed};
 use super::device::ComputeDevice;
-use super::keeper::{self, Kept};
+use super::keeper::{Keeper, Kept};
 use super::record::Recorder;
 use super::{Model, layered, load_scene, log_machine, quality, scene_name};
 use crate::cli::{DeviceArgs, SettingsArgs};
@@ -10,7 +13,7 @@ use crate::diagnostics::{Failure, Result};
 use crate::interrupt;
 use crate::progress::{self, TrainProgress};
 use crate::report::{Figure, Measured, Report, html};
-use crate::run_dir::RunDir;
+use crate::run_dir::{RunDir, checkpoints};
 use crate::settings::{self, Settings};
 use crate::terms::TermSection;
 use clap::Args;
@@ -18,11 +21,12 @@ use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Dataset, GaussianCloud};
 use gazesplat_fovea::hvsq::ReferenceCache;
 use gazesplat_render::Splats;
+use gazesplat_train::checkpoint::fingerprint;
 use gazesplat_train::{Config, EvalReport, Outcome, Trainer, with_threads};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Arguments of `train`.
 #[derive(Debug, Args)]
@@ -33,9 +37,12 @@ Examples:
   gazesplat train my_capture --config my.toml --set train.seed=1
   gazesplat train my_capture --device gpu
   gazesplat train my_capture --init runs/my_capture-1 --config finetune --set loss.hvsq.weight=100
+  gazesplat train my_capture --out runs/mine --resume
 
-Ctrl-C stops after the current step and keeps what there is; a second Ctrl-C ends at once. A run
-that fails leaves its last good model in `unfinished.ply`; on a GPU copies go there on the way.")]
+Ctrl-C stops after the current step and keeps what there is, with a checkpoint that the same command
+goes on from with `--out DIR --resume`; a second Ctrl-C ends at once. So does a run that is killed,
+from its last checkpoint (`train.checkpoint_every`). On the CPU the result is that of a run that was
+never interrupted, byte for byte. A run that finishes removes its checkpoints. A run that fails leaves its last good model in `unfinished.ply`; on a GPU copies go there on the way.")]
 pub struct TrainArgs {
     /// The scene: a COLMAP directory or one with `transforms.json`
     pub scene: PathBuf,
@@ -51,6 +58,10 @@ pub struct TrainArgs {
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
+    /// Go on with the interrupted run in the directory given with --out, from its latest checkpoint or that of STEP
+    #[arg(long, value_name = "STEP", num_args = 0..=1, require_equals = true)]
+    #[arg(requires = "out", conflicts_with = "overwrite")]
+    pub resume: Option<Option<u32>>,
     /// Replace the run that is in the directory given with --out
     #[arg(long)]
     pub overwrite: bool,
@@ -66,7 +77,8 @@ pub fn command(args: &TrainArgs, console: &Console) -> Result<()> {
     let device = &ComputeDevice::open(args.device.device, console)?;
     let init = args.init.as_deref().map(|path| Model::load_to_train(path, console)).transpose()?;
     let (out, overwrite) = (args.out.as_deref(), args.overwrite);
-    let job = TrainJob { scene: &args.scene, config, terms, init, out, overwrite, device };
+    let resume = args.resume;
+    let job = TrainJob { scene: &args.scene, config, terms, init, out, overwrite, device, resume, is_resumable: true };
     train(&job, interrupt::stop_flag()?, console)?;
     Ok(())
 }
@@ -88,6 +100,10 @@ pub struct TrainJob<'a> {
     pub overwrite: bool,
     /// Where to compute.
     pub device: &'a ComputeDevice,
+    /// Whether the interrupted run in `out` goes on, and from the checkpoint of which step; `Some(None)` = the latest.
+    pub resume: Option<Option<u32>>,
+    /// Whether the run leaves checkpoints.
+    pub is_resumable: bool,
 }
 
 /// What a training left behind.
@@ -142,20 +158,38 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     ));
     let mut warnings = dataset.warnings.clone();
     let run_dir = match job.out {
+        Some(out) if job.resume.is_some() => RunDir::open_interrupted(out)?,
         Some(out) => RunDir::create(out, job.overwrite)?,
         None => RunDir::create_numbered(&scene_name(job.scene))?,
     };
 
     let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
     preload(&images, console)?;
-    let (mut trainer, cache) = job.device.guard(|| {
+    let mut saved = Checkpoints::new(&run_dir, config, beside(job), job.device.describe());
+    let (mut trainer, earlier, cache) = job.device.guard(|| {
         let (images, device) = (Arc::clone(&images), job.device.tensors());
-        let mut trainer = match &job.init {
-            Some(model) => Trainer::from_cloud(&model.cloud, &dataset, images, config, device)?,
-            None => Trainer::new(&dataset, images, config, device)?,
+        let (mut trainer, earlier) = match (&job.resume, &job.init) {
+            (Some(from), _) => {
+                let metrics = run_dir.metrics_path();
+                let Resumed { trainer, metrics, earlier, warning } =
+                    saved.resume(*from, &dataset, images, config, device, metrics)?;
+                console.note(format_args!(
+                    "resuming `{}` at step {} of {}",
+                    run_dir.path().display(),
+                    trainer.step_index(),
+                    config.train.steps
+                ));
+                if let Some(warning) = warning {
+                    console.warn(&warning);
+                    warnings.push(warning);
+                }
+                (trainer, Some((metrics, earlier)))
+            }
+            (None, Some(model)) => (Trainer::from_cloud(&model.cloud, &dataset, images, config, device)?, None),
+            (None, None) => (Trainer::new(&dataset, images, config, device)?, None),
         };
         let cache = job.terms.loss.hvsq.register(&mut trainer)?;
-        Ok((trainer, cache))
+        Ok((trainer, earlier, cache))
     })?;
     warnings.extend_from_slice(trainer.messages());
     let (measured, measured_images) = match dataset.test.is_empty() {
@@ -182,14 +216,24 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         run_dir.clear()?;
     }
     run_dir.write_settings(&all_settings, job.scene, &job.device.describe())?;
-    let mut recorder = Recorder::new(run_dir.start_metrics()?, config.train.log_every, job.device.is_gpu());
-    let mut bar = TrainProgress::new(console, config.train.steps);
+    let is_resumed = earlier.is_some();
+    let (log, earlier) = match earlier {
+        Some(earlier) => earlier,
+        None => (run_dir.start_metrics()?, Duration::ZERO),
+    };
+    let mut recorder = Recorder::new(log, config.train.log_every, job.device.is_gpu());
+    if is_resumed {
+        recorder.recall()?;
+    }
+    let mut bar = TrainProgress::new(console, config.train.steps).after(trainer.step_index());
     let started = Instant::now();
+    saved.start(earlier);
     let mut kept = None;
-    let ended = keeper::run(&mut trainer, &mut [&mut recorder, &mut bar], stop, job.device, &run_dir, &mut kept);
+    let keeper = Keeper { run_dir: &run_dir, checkpoints: job.is_resumable.then_some(&saved), console };
+    let ended = keeper.run(&mut trainer, &mut [&mut recorder, &mut bar], stop, job.device, &mut kept);
     drop(bar);
     recorder.flush()?;
-    let train_secs = started.elapsed().as_secs_f64();
+    let train_secs = (earlier + started.elapsed()).as_secs_f64();
     durations.push(("training".to_owned(), train_secs));
     let num_steps = trainer.step_index();
     // A lost GPU takes the model with it; what a person waited for is then the last copy.
@@ -210,6 +254,9 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     run_dir.remove_unfinished()?;
     if outcome == Outcome::Stopped {
         console.note(format_args!("stopped after {num_steps} of {} steps, saving what there is", config.train.steps));
+        if !checkpoints(run_dir.path()).is_empty() {
+            console.note(format_args!("go on with the same command and `--out {} --resume`", run_dir.path().display()));
+        }
     }
 
     let started = Instant::now();
@@ -258,6 +305,9 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         settings: all_settings,
     };
     run_dir.write_report(&html::page(&report))?;
+    if outcome == Outcome::Finished {
+        saved.clear()?;
+    }
     console.note(format_args!(
         "{}: {:.2} dB PSNR, {:.3} SSIM on {} {measured_name} views, {} Gaussians, {}",
         run_dir.path().display(),
@@ -269,6 +319,13 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     ));
     console.note(format_args!("look at `{}`", run_dir.report_path().display()));
     Ok(Trained { run_dir, dataset, cloud, num_steps, eval, report })
+}
+
+/// What has to be the same in a resumed run beside the settings of the library.
+fn beside(job: &TrainJob<'_>) -> serde_json::Value {
+    let mut beside = serde_json::to_value(&job.terms).expect("settings are plain data");
+    beside["init"] = job.init.as_ref().map(|model| fingerprint(&model.cloud)).into();
+    beside
 }
 
 /// How many views are kept out of gradient steps, to stand behind the number of training views; nothing for none.
@@ -293,6 +350,10 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
         return failure;
     };
     let path = run_dir.unfinished_path();
+    let failure = match checkpoints(run_dir.path()).first() {
+        Some((_, path)) => failure.hint_first(format!("`--resume` goes on from `{}`", path.display())),
+        None => failure,
+    };
     match run_dir.write_unfinished(&cloud) {
         Ok(()) => failure.hint_first(format!("the model as it was after step {step} is in `{}`", path.display())),
         Err(_) => failure,

@@ -12,6 +12,7 @@ mod hvsq;
 mod info;
 mod prune;
 mod render;
+mod resume;
 mod settings;
 mod support;
 mod synth;

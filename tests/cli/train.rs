@@ -219,6 +219,9 @@ fn interrupt_saves_what_there_is() {
     let output = child.wait_with_output().expect("ends");
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(said.contains("stopped after") && said.contains("saving what there is"), "{said}");
-    let files = ["eval.json", "metrics.jsonl", "point_cloud.ply", "report.html", "settings.toml"];
-    assert_eq!(place.list("out"), files);
+    assert!(said.contains("go on with the same command and `--out out --resume`"), "{said}");
+    let (checkpoints, files): (Vec<_>, Vec<_>) =
+        place.list("out").into_iter().partition(|name| name.starts_with("checkpoint-"));
+    assert_eq!(files, ["eval.json", "metrics.jsonl", "point_cloud.ply", "report.html", "settings.toml"]);
+    assert_eq!(checkpoints.len(), 1, "{checkpoints:?}");
 }

@@ -7,6 +7,7 @@ use crate::error::{Error, Result};
 use crate::kernels::cpu::rows::Rows;
 use crate::optim::{Columns, Group, HostState};
 use gazesplat_core::io::write_atomically;
+use gazesplat_core::{Camera, GaussianCloud};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
 use serde::{Serialize, de::DeserializeOwned};
 use std::collections::HashMap;
@@ -132,6 +133,56 @@ fn columns(file: &SafeTensors<'_>, prefix: &str) -> std::result::Result<Columns,
 
 fn float(bytes: &[u8]) -> f32 {
     f32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])
+}
+
+/// FNV-1a over the bits of all parameters: tells models apart, not attackers.
+pub fn fingerprint(cloud: &GaussianCloud) -> String {
+    hashed(
+        [cloud.means.as_flattened(), cloud.quats.as_flattened(), cloud.log_scales.as_flattened()]
+            .into_iter()
+            .chain([cloud.opacity_logits.as_slice(), cloud.sh.as_flattened()])
+            .flatten()
+            .copied(),
+    )
+}
+
+/// The same over sizes, lenses and poses.
+pub(crate) fn fingerprint_of_cameras<'a>(cameras: impl Iterator<Item = &'a Camera>) -> String {
+    let values = |camera: &Camera| {
+        let p = camera.intrinsics;
+        let lens = [p.width as f32, p.height as f32, p.fx, p.fy, p.cx, p.cy];
+        lens.into_iter().chain(camera.camera_from_world.to_cols_array())
+    };
+    hashed(cameras.flat_map(values))
+}
+
+fn hashed(values: impl Iterator<Item = f32>) -> String {
+    let step = |hash: u64, value: f32| (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0000_0100_0000_01b3);
+    format!("{:016x}", values.fold(0xcbf2_9ce4_8422_2325, step))
+}
+
+/// Settings that differ, as `key = old, now new`, but for those of `free`, which change nothing of the result.
+pub fn differences(old: &impl Serialize, new: &impl Serialize, free: &[&str]) -> Vec<String> {
+    fn compare(path: &str, old: &serde_json::Value, new: &serde_json::Value, free: &[&str], out: &mut Vec<String>) {
+        match (old.as_object(), new.as_object()) {
+            (Some(a), Some(b)) => {
+                for (key, value) in a {
+                    let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
+                    compare(&path, value, b.get(key).unwrap_or(&serde_json::Value::Null), free, out);
+                }
+            }
+            _ if old == new || free.contains(&path) => {}
+            _ => out.push(format!("{path} = {old}, now {new}")),
+        }
+    }
+    // Through the same text as the recorded ones went: reading a number back may cost its last digit.
+    fn tree(config: &impl Serialize) -> serde_json::Value {
+        let text = serde_json::to_string(config).expect("settings are plain data");
+        serde_json::from_str(&text).expect("our own text")
+    }
+    let (mut out, old) = (Vec::new(), tree(&tree(old)));
+    compare("", &old, &tree(&tree(new)), free, &mut out);
+    out
 }
 
 #[cfg(test)]

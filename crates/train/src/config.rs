@@ -1,6 +1,7 @@
 //! Settings of a training run: plain data with defaults in place, unknown keys rejected.
 //!
-//! Keys with a step count say how they behave in runs shorter than the 30,000 steps the published defaults are made for.
+//! Keys with a step count say how they behave in runs shorter than the 30,000 steps the published defaults are made for. The
+//! file is long because all keys stand in one file, each with its default beside it.
 
 use crate::error::{Error, Result};
 pub use gazesplat_core::dataset::Holdout;
@@ -44,11 +45,24 @@ pub struct TrainSection {
     /// The test views are measured every this many steps, and after the last; 0 = only after the last. At most 1/6 of
     /// the run, unless measuring that often would take more than some 5 % of its time. Default 5000.
     pub eval_every: u32,
+    /// A checkpoint is written every this many steps, and when the run is stopped; 0 = only then. Default 5000.
+    pub checkpoint_every: u32,
+    /// So many of the latest checkpoints stay while the run is under way; a run that finishes removes them. At least 1.
+    /// Default 1.
+    pub checkpoint_keep: u32,
 }
 
 impl Default for TrainSection {
     fn default() -> Self {
-        Self { steps: 30_000, seed: 0, threads: 0, log_every: 10, eval_every: 5000 }
+        Self {
+            steps: 30_000,
+            seed: 0,
+            threads: 0,
+            log_every: 10,
+            eval_every: 5000,
+            checkpoint_every: 5000,
+            checkpoint_keep: 1,
+        }
     }
 }
 
@@ -321,6 +335,7 @@ impl Config {
         let open_unit = |key: &str, value: f32| check(value > 0.0 && value < 1.0, key, &value, "a number in (0, 1)");
         check(self.train.steps >= 1, "train.steps", &self.train.steps, "at least 1")?;
         check(self.train.log_every >= 1, "train.log_every", &self.train.log_every, "at least 1")?;
+        check(self.train.checkpoint_keep >= 1, "train.checkpoint_keep", &self.train.checkpoint_keep, "at least 1")?;
         if let Background::Rgb(rgb) = self.data.background {
             for value in rgb {
                 check((0.0..=1.0).contains(&value), "data.background", &value, "three numbers in 0..1")?;

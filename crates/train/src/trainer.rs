@@ -4,10 +4,11 @@
 //! graph is gone updates them where they are: nothing of the model's size is copied. SH bands that are not learned yet
 //! are not stored, so that a young model is a quarter of the size of a grown one.
 //!
-//! The file is a little long: how a trainer begins, goes back and goes on stands beside the step it must not disturb.
+//! On a GPU a step only queues work, unless scales decay: the counters that takes are read back. The host reads the loss
+//! in the steps that are reported, and before it measures or ends; a loss that is not finite stops the model on the device
+//! at once, and the run at the next such read.
 //!
-//! On a GPU a step only queues work, unless scales decay: the counters that takes are read back. The host reads the loss in the steps that are reported, and before it measures or
-//! ends; a loss that is not finite stops the model on the device at once, and the run at the next such read.
+//! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`.
 
 use crate::backend::Status;
 use crate::config::{Background, Config, NamedBackground, StrategyKind};
@@ -29,6 +30,8 @@ use gazesplat_render::{Pass, RenderOptions, Rendered, Splats, StatsMode, is_gpu,
 use std::sync::Arc;
 use std::time::Instant;
 
+mod resume;
+
 /// γ of scale decay (RTGS Eq. 4).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ScaleDecay {
@@ -45,6 +48,8 @@ pub struct Trainer {
     test_images: Arc<ImageCache>,
     state: ModelState,
     strategy: Box<dyn Strategy>,
+    /// Gaussians at step 0, of which the schedule of growth is a function.
+    num_initial: usize,
     /// Step at which the rows were last sorted.
     sorted_at: u32,
     losses: WeightedLosses,
@@ -83,27 +88,37 @@ impl Trainer {
     ) -> Result<Self> {
         config.validate()?;
         cloud.validate_shape()?;
-        if images.is_empty() {
-            return Err(Error::NoTrainingViews { num_test: dataset.test.len() });
-        }
-        check_limits(cloud, &images, config, device)?;
+        check_scene(dataset, &images, (cloud.len(), cloud.num_coefficients()), config, device)?;
+        // Sorted before they are uploaded: the host's order follows the box around the means, however far they reach.
+        let mut rows = Rows::new(Columns::from_cloud(cloud));
+        rows.sort_spatially();
+        let state = ModelState::new(rows.params, AdamSettings::default(), device)?;
+        Ok(Self::around(state, cloud.len(), dataset, images, config))
+    }
+
+    /// A trainer at step 0 of a run that began with `num_initial` Gaussians.
+    fn around(
+        state: ModelState,
+        num_initial: usize,
+        dataset: &Dataset,
+        images: Arc<ImageCache>,
+        config: &Config,
+    ) -> Self {
         let extent = positive_extent(dataset.scene_extent());
         let cameras: Vec<Camera> = images.views().iter().map(|v| v.camera).collect();
         let center: [f32; 3] = camera_center(&cameras).into();
         let strategy: Box<dyn Strategy> = match config.densify.strategy {
-            StrategyKind::Mcmc => Box::new(Mcmc::new(&config.densify, config.train.steps, cloud.len(), center, extent)),
+            StrategyKind::Mcmc => Box::new(Mcmc::new(&config.densify, config.train.steps, num_initial, center, extent)),
             StrategyKind::None => Box::new(Fixed),
         };
-        // Sorted before they are uploaded: the host's order follows the box around the means, however far they reach.
-        let mut rows = Rows::new(Columns::from_cloud(cloud));
-        rows.sort_spatially();
         let losses = WeightedLosses::default().with(1.0, Box::new(L1Ssim { ssim_weight: config.loss.ssim_weight }));
-        Ok(Self {
+        Self {
             test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
             config: config.clone(),
             images,
-            state: ModelState::new(rows.params, AdamSettings::default(), device)?,
+            state,
             strategy,
+            num_initial,
             sorted_at: 0,
             losses,
             scale_decay: None,
@@ -112,7 +127,7 @@ impl Trainer {
             step: 0,
             view_order: None,
             messages: Vec::new(),
-        })
+        }
     }
 
     /// Adds `weight` times `loss` to what every step minimises.
@@ -156,6 +171,7 @@ impl Trainer {
             test_images: Arc::clone(&self.test_images),
             state: ModelState::new(rows.params, AdamSettings::default(), self.state.device())?,
             strategy: Box::new(Fixed),
+            num_initial: cloud.len(),
             sorted_at: 0,
             losses: std::mem::take(&mut self.losses),
             scale_decay: None,
@@ -368,6 +384,20 @@ impl Trainer {
             fixed => fixed.fixed_rgb(),
         }
     }
+}
+
+/// Refuses a scene without views, and what the device cannot hold of `size`: Gaussians, and coefficients of each.
+fn check_scene(
+    dataset: &Dataset,
+    images: &ImageCache,
+    size: (usize, usize),
+    config: &Config,
+    device: &Device,
+) -> Result<()> {
+    if images.is_empty() {
+        return Err(Error::NoTrainingViews { num_test: dataset.test.len() });
+    }
+    check_limits(size, images, config, device)
 }
 
 /// The parameters, shared, as leaves of a fresh graph.

@@ -11,6 +11,7 @@
 
 use super::super::device::ComputeDevice;
 use crate::diagnostics::{Failure, Result};
+use crate::json_lines::JsonLines;
 use crate::run_dir::{RunDir, cannot_write, create_all, remove, write_text};
 use crate::settings;
 use crate::terms::PruneTerms;
@@ -19,8 +20,7 @@ use gazesplat_core::io::ply;
 use gazesplat_train::Config;
 use gazesplat_train::prune::{Check, Noted, PruneConfig, Pruner};
 use serde::Serialize;
-use std::fs::{self, File, OpenOptions};
-use std::io::Write as _;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 /// A level is kept when the model has shrunk to this share of the last one kept: some ten levels down to a quarter.
@@ -29,8 +29,7 @@ const LEVEL_STEP: f64 = 0.87;
 /// The directory, and its growing report.
 pub(super) struct PruneDir {
     run_dir: RunDir,
-    report: Option<File>,
-    report_bytes: u64,
+    report: Option<JsonLines>,
     last_level: Option<usize>,
     replaces: bool,
 }
@@ -49,7 +48,7 @@ impl PruneDir {
             Some(out) => RunDir::create(out, overwrite)?,
             None => RunDir::create_numbered(name)?,
         };
-        Ok(Self { run_dir, report: None, report_bytes: 0, last_level: None, replaces: overwrite })
+        Ok(Self { run_dir, report: None, last_level: None, replaces: overwrite })
     }
 
     /// The directory of a run that was interrupted.
@@ -61,7 +60,7 @@ impl PruneDir {
                 .hint("without `--resume` a new run begins"));
         }
         let run_dir = RunDir::create(out, true)?;
-        let mut dir = Self { run_dir, report: None, report_bytes: 0, last_level: None, replaces: false };
+        let mut dir = Self { run_dir, report: None, last_level: None, replaces: false };
         dir.last_level = dir.levels().into_iter().map(|(points, _)| points).min();
         Ok(dir)
     }
@@ -112,33 +111,18 @@ impl PruneDir {
 
     /// Starts `prune.jsonl` with `header`.
     pub fn begin_report(&mut self, header: &impl Serialize) -> Result<()> {
-        let path = self.report_path();
-        self.report = Some(File::create(&path).map_err(|e| cannot_write(&path, e))?);
+        self.report = Some(JsonLines::create(self.report_path())?);
         self.append_line(header)
     }
 
     /// Cuts the report to what the checkpoint knows of, and goes on behind it.
     pub fn continue_report(&mut self, len: u64) -> Result<()> {
-        let path = self.report_path();
-        let file = OpenOptions::new().append(true).open(&path).map_err(|e| cannot_write(&path, e))?;
-        let found = file.metadata().map_err(|e| cannot_write(&path, e))?.len();
-        if found < len {
-            return Err(Failure::new(format!("`{}` has {found} bytes, the checkpoint knows of {len}", path.display()))
-                .hint("the report was changed after the run was interrupted: begin anew with `--overwrite`"));
-        }
-        file.set_len(len).map_err(|e| cannot_write(&path, e))?;
-        (self.report, self.report_bytes) = (Some(file), len);
+        self.report = Some(JsonLines::go_on(self.report_path(), len)?);
         Ok(())
     }
 
     fn append_line(&mut self, record: &impl Serialize) -> Result<()> {
-        let path = self.report_path();
-        let mut line = serde_json::to_vec(record).expect("records are plain numbers and text");
-        line.push(b'\n');
-        let file = self.report.as_mut().expect("the report was begun");
-        file.write_all(&line).and_then(|()| file.flush()).map_err(|e| cannot_write(&path, e))?;
-        self.report_bytes += line.len() as u64;
-        Ok(())
+        self.report.as_mut().expect("the report was begun").append(record)
     }
 
     /// Appends a check.
@@ -159,11 +143,12 @@ impl PruneDir {
 
     /// Writes the checkpoint.
     pub fn save(&self, pruner: &mut Pruner, elapsed_s: f64) -> Result<()> {
-        // The checkpoint says how long the report is: it must not reach the disk first.
+        let mut report_bytes = 0;
         if let Some(report) = &self.report {
-            report.sync_data().map_err(|e| cannot_write(&self.report_path(), e))?;
+            report.sync()?;
+            report_bytes = report.num_bytes();
         }
-        Ok(pruner.save(&self.checkpoint_path(), Noted { report_bytes: self.report_bytes, elapsed_s })?)
+        Ok(pruner.save(&self.checkpoint_path(), Noted { report_bytes, elapsed_s })?)
     }
 
     /// A failure of a step, with what is left to go on from.

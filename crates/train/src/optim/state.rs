@@ -118,6 +118,16 @@ impl ModelState {
         })
     }
 
+    /// The model of `state` on `device`, with its moments.
+    ///
+    /// # Errors
+    /// As [`ModelState::new`].
+    pub(crate) fn from_host(state: HostState, settings: AdamSettings, device: &Device) -> Result<Self> {
+        let Snapshot { tensors, num_updates } = Snapshot::from_host(state, device)?;
+        let is_handed_out = AtomicBool::new(false);
+        Ok(Self { tensors: Some(tensors), settings, num_updates, is_handed_out, device: device.clone() })
+    }
+
     fn tensors(&self) -> &State<Dispatch> {
         self.tensors.as_ref().expect("only an operation in progress takes the tensors")
     }

@@ -10,7 +10,7 @@ use super::guard::{Basis, Reference, check_reference, measure};
 use super::phase::{Noted, Origin, Passed, Phase, Record};
 use super::report::{Check, Measured, Outcome, Part, Status};
 use super::state::{kept, num_removed, rank, remove_faded};
-use crate::checkpoint;
+use crate::checkpoint::{self, differences, fingerprint, fingerprint_of_cameras};
 use crate::error::{Error, Result};
 use crate::event::StepReport;
 use crate::metrics::Guard;
@@ -83,6 +83,8 @@ pub const MIN_DENSE_POINTS: usize = 100;
 pub const POOR_REFERENCE_DB: f64 = 10.0;
 /// Kind of run, as checkpoints name it.
 const KIND: &str = "prune";
+/// Settings that change nothing of the result.
+const FREE: &[&str] = &["prune.threads"];
 
 impl Pruner {
     /// A run at its beginning.
@@ -171,10 +173,10 @@ impl Pruner {
             };
             return Err(refuse(format!("it is of a run {what}")));
         }
-        let mut differences = differences(&record.config, job.config);
-        differences.extend(self::differences(&record.more_settings, job.more_settings));
-        if !differences.is_empty() {
-            return Err(refuse(format!("its settings differ: {}", differences.join(", "))));
+        let mut found = differences(&record.config, job.config, FREE);
+        found.extend(differences(&record.more_settings, job.more_settings, FREE));
+        if !found.is_empty() {
+            return Err(refuse(format!("its settings differ: {}", found.join(", "))));
         }
         let incomplete = || refuse("damaged: a model is missing".to_owned());
         let state: HostState = loaded.take("state").ok_or_else(incomplete)?;
@@ -569,54 +571,4 @@ pub fn one_shot(
         kept(num_rows, &ranked.order[..num_rows.saturating_sub(num)])
     };
     Ok(keep.iter().map(rows).collect())
-}
-
-/// FNV-1a over the bits of all parameters: tells models apart, not attackers.
-fn fingerprint(cloud: &GaussianCloud) -> String {
-    hashed(
-        [cloud.means.as_flattened(), cloud.quats.as_flattened(), cloud.log_scales.as_flattened()]
-            .into_iter()
-            .chain([cloud.opacity_logits.as_slice(), cloud.sh.as_flattened()])
-            .flatten()
-            .copied(),
-    )
-}
-
-fn fingerprint_of_cameras<'a>(cameras: impl Iterator<Item = &'a Camera>) -> String {
-    let values = |camera: &Camera| {
-        let p = camera.intrinsics;
-        let lens = [p.width as f32, p.height as f32, p.fx, p.fy, p.cx, p.cy];
-        lens.into_iter().chain(camera.camera_from_world.to_cols_array())
-    };
-    hashed(cameras.flat_map(values))
-}
-
-fn hashed(values: impl Iterator<Item = f32>) -> String {
-    let step = |hash: u64, value: f32| (hash ^ u64::from(value.to_bits())).wrapping_mul(0x0000_0100_0000_01b3);
-    format!("{:016x}", values.fold(0xcbf2_9ce4_8422_2325, step))
-}
-
-/// Settings that differ, as `key = old, now new`.
-fn differences(old: &impl serde::Serialize, new: &impl serde::Serialize) -> Vec<String> {
-    fn compare(path: &str, old: &serde_json::Value, new: &serde_json::Value, out: &mut Vec<String>) {
-        match (old.as_object(), new.as_object()) {
-            (Some(a), Some(b)) => {
-                for (key, value) in a {
-                    let path = if path.is_empty() { key.clone() } else { format!("{path}.{key}") };
-                    compare(&path, value, b.get(key).unwrap_or(&serde_json::Value::Null), out);
-                }
-            }
-            // The number of threads changes nothing of the result.
-            _ if old == new || path == "prune.threads" => {}
-            _ => out.push(format!("{path} = {old}, now {new}")),
-        }
-    }
-    // Through the same text as the recorded ones went: reading a number back may cost its last digit.
-    fn tree(config: &impl serde::Serialize) -> serde_json::Value {
-        let text = serde_json::to_string(config).expect("settings are plain data");
-        serde_json::from_str(&text).expect("our own text")
-    }
-    let (mut out, old) = (Vec::new(), tree(&tree(old)));
-    compare("", &old, &tree(&tree(new)), &mut out);
-    out
 }

@@ -68,7 +68,7 @@ pub(super) fn remove_faded(state: &mut ModelState, min_opacity: f32, min_points:
     let logits = host::read(state.lent().opacity_logits)?;
     let least = (min_opacity / (1.0 - min_opacity)).ln();
     // A logit that is not a number is below every bound.
-    let is_faded = |logit: f32| !(logit >= least);
+    let is_faded = |logit: f32| logit.is_nan() || logit < least;
     let mut faded: Vec<u32> = (0..logits.len() as u32).filter(|&i| is_faded(logits[i as usize])).collect();
     let allowed = logits.len().saturating_sub(min_points);
     if faded.len() > allowed {

@@ -1,0 +1,268 @@
+//! Checkpoints of a trainer: what of a run is no function of its seed and step.
+//!
+//! That is the model with its moments, the step, when the rows were last sorted, and with how many Gaussians the run
+//! began. Views, backgrounds, noise and draws are counter-based, so on a CPU a resumed run ends in the same bytes.
+
+use super::{Trainer, check_scene};
+use crate::checkpoint::{self, differences, fingerprint_of_cameras};
+use crate::config::Config;
+use crate::error::{Error, Result};
+use crate::optim::{AdamSettings, ModelState};
+use burn::tensor::Device;
+use gazesplat_core::dataset::Dataset;
+use gazesplat_core::io::images::ImageCache;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use std::sync::Arc;
+
+/// Kind of run, as checkpoints name it.
+const KIND: &str = "train";
+/// Settings that change nothing of the model.
+const FREE: &[&str] = &["train.threads", "train.checkpoint_every", "train.checkpoint_keep", "data.cache_bytes"];
+
+/// What a checkpoint holds beside the model.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+struct Record<N> {
+    /// Version of the library: another one may train another model.
+    version: String,
+    config: Config,
+    origin: Origin,
+    step: u32,
+    sorted_at: u32,
+    num_initial: usize,
+    noted: N,
+}
+
+/// The scene of a run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+struct Origin {
+    /// Names of the training views, then of the test views.
+    views: [Vec<String>; 2],
+    /// Fingerprint of the cameras of the training views.
+    cameras: String,
+    /// Bits of the radius of the scene: a decimal number may lose its last digit.
+    extent: u32,
+}
+
+impl Trainer {
+    /// Writes everything the run needs to go on, and what the caller wants to find again. A file that was there before
+    /// stays until the new one is complete on the disk.
+    ///
+    /// # Errors
+    /// When the device does not answer, an earlier step failed, or the file cannot be written.
+    pub fn save(&mut self, path: &Path, noted: &impl Serialize) -> Result<()> {
+        self.settle()?;
+        let record = Record {
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            config: self.config.clone(),
+            origin: self.origin(),
+            step: self.step,
+            sorted_at: self.sorted_at,
+            num_initial: self.num_initial,
+            noted,
+        };
+        let state = self.state.snapshot()?.to_host()?;
+        checkpoint::save(path, KIND, &record, &[("state", &state)])
+    }
+
+    /// Takes up the run that left the checkpoint at `path`, and returns what its caller had noted. Terms that were added
+    /// to the loss are added again by the caller.
+    ///
+    /// # Errors
+    /// [`Error::Checkpoint`] when the file is damaged, or of another scene, version or settings, each difference named; as
+    /// [`Trainer::from_cloud`].
+    pub fn resume<N: DeserializeOwned>(
+        dataset: &Dataset,
+        images: Arc<ImageCache>,
+        config: &Config,
+        device: &Device,
+        path: &Path,
+    ) -> Result<(Self, N)> {
+        config.validate()?;
+        let mut loaded: checkpoint::Loaded<Record<N>> = checkpoint::load(path, KIND, &["state"])?;
+        let refuse = |message: String| Error::Checkpoint { path: path.to_owned(), message };
+        let state = loaded.take("state").ok_or_else(|| refuse("damaged: the model is missing".to_owned()))?;
+        let Record { version, config: recorded, origin, step, sorted_at, num_initial, noted } = loaded.meta;
+        let current = env!("CARGO_PKG_VERSION");
+        if version != current {
+            return Err(refuse(format!("it is of version {version}, this is {current}")));
+        }
+        let found = differences(&recorded, config, FREE);
+        if !found.is_empty() {
+            return Err(refuse(format!("its settings differ: {}", found.join(", "))));
+        }
+        let size = (state.rows.params.num_rows(), state.rows.params.num_coefficients());
+        check_scene(dataset, &images, size, config, device)?;
+        let state = ModelState::from_host(state, AdamSettings::default(), device)?;
+        let mut trainer = Self::around(state, num_initial, dataset, images, config);
+        let expected = trainer.origin();
+        if origin != expected {
+            let what = if origin.views == expected.views { "with other cameras" } else { "on other views" };
+            return Err(refuse(format!("it is of a run {what}")));
+        }
+        (trainer.step, trainer.sorted_at) = (step, sorted_at);
+        Ok((trainer, noted))
+    }
+
+    fn origin(&self) -> Origin {
+        let names = |images: &ImageCache| images.views().iter().map(|view| view.name.clone()).collect();
+        Origin {
+            views: [names(&self.images), names(&self.test_images)],
+            cameras: fingerprint_of_cameras(self.images.views().iter().map(|view| &view.camera)),
+            extent: self.extent.to_bits(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gazesplat_core::synthetic::{SynthOptions, write_scene};
+    use gazesplat_render::{cpu_device, device::gpu_device};
+    use gazesplat_testkit::devices::required_gpu;
+
+    /// Long enough for two sortings of the rows: they are at least 200 steps apart.
+    const NUM_STEPS: u32 = 520;
+
+    fn scene(num_views: usize) -> (tempfile::TempDir, Dataset) {
+        let dir = tempfile::tempdir().expect("temporary directory");
+        let options = SynthOptions {
+            num_views,
+            width: 40,
+            height: 28,
+            samples_per_side: 1,
+            num_points: 150,
+            ..SynthOptions::default()
+        };
+        let dataset = write_scene(dir.path(), &options).expect("writable");
+        (dir, dataset)
+    }
+
+    fn config() -> Config {
+        let mut config = Config::default();
+        config.train.steps = NUM_STEPS;
+        config.densify.cap = 400;
+        config.model.sh_degree = 2;
+        config.data.background = crate::config::Background::Named(crate::config::NamedBackground::Random);
+        config
+    }
+
+    fn images(dataset: &Dataset) -> Arc<ImageCache> {
+        Arc::new(ImageCache::new(dataset.train.clone(), 1 << 30))
+    }
+
+    fn resumed(dataset: &Dataset, config: &Config, device: &Device, path: &Path) -> Result<(Trainer, String)> {
+        Trainer::resume(dataset, images(dataset), config, device, path)
+    }
+
+    /// Everything that the end of a run is made of: parameters, moments, updates; and the last sorting.
+    fn end(mut trainer: Trainer) -> (crate::optim::HostState, u32) {
+        while trainer.step < NUM_STEPS {
+            trainer.step().expect("trains");
+        }
+        (trainer.state.snapshot().and_then(|s| s.to_host()).expect("readable"), trainer.sorted_at)
+    }
+
+    #[test]
+    fn interrupted_runs_end_in_the_bytes_of_the_uninterrupted_one() {
+        let (dir, dataset) = scene(7);
+        let (config, device) = (config(), cpu_device());
+        let fresh = || Trainer::new(&dataset, images(&dataset), &config, &device).expect("valid");
+        // Where something changes: the stop falls before, at and after it.
+        let (mut watched, mut stops) = (fresh(), vec![0, 1]);
+        let mut kinds = [0; 3];
+        let mut before = (watched.num_gaussians(), watched.state.num_coefficients(), watched.sorted_at);
+        while watched.step < NUM_STEPS {
+            watched.step().expect("trains");
+            let after = (watched.num_gaussians(), watched.state.num_coefficients(), watched.sorted_at);
+            let changes = [before.0 != after.0, before.1 != after.1, before.2 != after.2];
+            for (kind, changed) in changes.into_iter().enumerate() {
+                // Of each kind the first two are enough.
+                if changed && kinds[kind] < 2 {
+                    kinds[kind] += 1;
+                    stops.extend([watched.step - 1, watched.step, watched.step + 1]);
+                }
+            }
+            before = after;
+        }
+        assert_eq!(kinds, [2; 3], "growth, SH bands and sortings are met");
+        stops.retain(|&stop| stop < NUM_STEPS);
+        stops.sort_unstable();
+        stops.dedup();
+        let expected = end(watched);
+        let path = dir.path().join("checkpoint");
+        // One run that is interrupted at all of them, each time taken up from the file.
+        let mut trainer = fresh();
+        for stop in stops {
+            while trainer.step < stop {
+                trainer.step().expect("trains");
+            }
+            trainer.save(&path, &format!("at {stop}")).expect("writable");
+            let (again, noted) = resumed(&dataset, &config, &device, &path).expect("valid");
+            assert_eq!((again.step, again.sorted_at, noted), (stop, trainer.sorted_at, format!("at {stop}")));
+            trainer = again;
+        }
+        assert!(end(trainer) == expected);
+    }
+
+    /// The device repeats its bits from run to run, so that the tolerance is none.
+    #[test]
+    fn a_gpu_goes_on_as_if_nothing_had_happened() {
+        let Some(device) = required_gpu(gpu_device(None)) else { return };
+        let (dir, dataset) = scene(5);
+        let mut config = config();
+        config.train.steps = 40;
+        let path = dir.path().join("checkpoint");
+        let mut trainer = Trainer::new(&dataset, images(&dataset), &config, &device).expect("valid");
+        let run = |trainer: &mut Trainer, to: u32| {
+            while trainer.step < to {
+                trainer.step().expect("trains");
+            }
+        };
+        run(&mut trainer, 23);
+        trainer.save(&path, &"noted").expect("writable");
+        let (mut again, _) = resumed(&dataset, &config, &device, &path).expect("valid");
+        run(&mut trainer, 40);
+        run(&mut again, 40);
+        assert!(trainer.to_cloud().expect("readable") == again.to_cloud().expect("readable"));
+    }
+
+    #[test]
+    fn checkpoints_of_other_runs_are_refused_with_what_differs() {
+        let (dir, dataset) = scene(7);
+        let (config, device, path) = (config(), cpu_device(), dir.path().join("checkpoint"));
+        let mut trainer = Trainer::new(&dataset, images(&dataset), &config, &device).expect("valid");
+        trainer.step().expect("trains");
+        trainer.save(&path, &"noted").expect("writable");
+        let refused = |dataset: &Dataset, config: &Config| {
+            let error = resumed(dataset, config, &device, &path).err().expect("refused");
+            assert!(error.hint().is_some());
+            error.to_string()
+        };
+        let mut other = config.clone();
+        (other.train.seed, other.densify.noise) = (4, 1.5);
+        let said = refused(&dataset, &other);
+        assert!(said.contains("train.seed = 0, now 4") && said.contains("densify.noise = "), "{said}");
+        let mut faster = config.clone();
+        (faster.train.threads, faster.train.checkpoint_every, faster.data.cache_bytes) = (3, 7, 1 << 20);
+        resumed(&dataset, &faster, &device, &path).expect("the model does not depend on these");
+        assert!(refused(&scene(8).1, &config).contains("on other views"));
+        let mut moved = dataset.clone();
+        moved.train[2].camera.intrinsics.fx += 0.5;
+        assert!(refused(&moved, &config).contains("with other cameras"));
+        let whole = std::fs::read(&path).expect("readable");
+        let version = format!("\\\"version\\\":\\\"{}", env!("CARGO_PKG_VERSION"));
+        let at = whole.windows(version.len()).position(|w| w == version.as_bytes()).expect("it is recorded");
+        let mut of_another = whole.clone();
+        of_another[at + version.len() - 1] = b'x';
+        std::fs::write(&path, of_another).expect("writable");
+        assert!(refused(&dataset, &config).contains("it is of version "));
+        std::fs::write(&path, &whole[..whole.len() - 9]).expect("writable");
+        assert!(refused(&dataset, &config).contains("damaged"));
+        // A save that fails leaves what was there.
+        std::fs::write(&path, &whole).expect("writable");
+        assert!(trainer.save(&dir.path().join("none/checkpoint"), &"noted").is_err());
+        resumed(&dataset, &config, &device, &path).expect("still there");
+    }
+}

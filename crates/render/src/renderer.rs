@@ -75,7 +75,8 @@ pub struct Counted {
 
 /// Counts what drawing `splats` as `camera` sees them does, as [`render`] with the same options would, but draws nothing:
 /// colours are not evaluated, unless a termination table asks for them, and no image is written; on a GPU, whose tiles end
-/// where its rasteriser says, one is composited and dropped. [`StatsMode::None`] counts nothing but the frame's totals.
+/// where its rasteriser says, one is composited and dropped. [`crate::StatsMode::None`] counts
+/// nothing but the frame's totals.
 ///
 /// # Errors
 /// As [`render`]; [`Error::Parameter`] for a pass with gradients.

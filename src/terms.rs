@@ -189,7 +189,7 @@ impl HvsqBound {
     /// `guard` with this bound, if it is one.
     ///
     /// # Errors
-    /// As [`hvsq_metric`].
+    /// When the pools are no number of pixels from 1 on.
     pub fn add_to(&self, guard: Guard) -> Result<Guard> {
         if self.at_most == 0.0 {
             return Ok(guard);

@@ -357,6 +357,12 @@ impl Pruner {
                 self.trainer.restarted(&cloud, self.config.training(self.plan.num_steps(), cloud.sh_degree))?;
         }
         let measured = self.measure()?;
+        if measured.pairs_per_tile == 0.0 {
+            return Err(Error::Prune(format!(
+                "none of the {} views that judge sees anything of the model: it belongs to another scene",
+                self.guard_images.len()
+            )));
+        }
         let reference = check_reference(&measured)?;
         let basis = Basis::for_reference(reference.psnr);
         self.hold(measured, basis);

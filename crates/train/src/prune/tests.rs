@@ -356,6 +356,19 @@ fn reference_below_the_guard_is_said_at_once() {
     assert!(message.contains("misses the guard before anything is removed"), "{message}");
 }
 
+#[test]
+fn judges_that_see_nothing_of_the_model_are_refused() {
+    let (config, device) = (config(), cpu_device());
+    let mut away = SCENE.dataset.train[0].clone();
+    away.camera.camera_from_world.w_axis.y += 1e6;
+    let mut job = job(&config, &SCENE.cloud, &device);
+    job.guard_images = images(&[away]);
+    let Err(Error::Prune(message)) = Pruner::new(&job).expect("training views see it").advance() else {
+        panic!("it must be refused")
+    };
+    assert!(message.contains("none of the 1 views that judge sees anything"), "{message}");
+}
+
 /// The published schedule with rounds that remove nothing is plain training.
 #[test]
 fn without_rounds_nothing_goes_but_what_fades() {

@@ -144,6 +144,8 @@ fn wrong_input_is_refused_with_a_reason() {
     assert!(!place.path("none").exists(), "nothing is left behind");
     let said = place.run(&["prune", "run", "--scene", "scene", "--quality", "x"]).stderr;
     assert!(said.contains("expected h, m, l, or a share"), "{said}");
+    let said = prune(&place, &["--out", "none", "--set", "guard.hvsq.at_most=1e-12"]);
+    assert!(said.code == 2 && said.stderr.contains("hvsq@3 of at most 1.000e-12"), "{}", said.stderr);
     let said = place.run(&["prune", "run", "--scene", "scene", "--out", "run", "--overwrite"]).refused();
     assert!(said.contains("is the dense model itself"), "{said}");
     assert!(place.path("run/point_cloud.ply").is_file());

@@ -94,6 +94,8 @@ impl Display {
     /// and y in image units as for [`Gaze`].
     pub fn direction(&self, size: (usize, usize), x: f64, y: f64) -> [f64; 3] {
         let aspect = size.1 as f64 / size.0 as f64;
+        // Farther is no other direction, and squares stay finite.
+        let [x, y] = [x, y].map(|v| v.clamp(-FARTHEST, FARTHEST));
         [(x - 0.5) * self.width, (y - 0.5) * self.width * aspect, 1.0]
     }
 
@@ -102,6 +104,9 @@ impl Display {
         angle(self.direction(size, gaze.x(), gaze.y()), self.direction(size, x, y))
     }
 }
+
+/// Points beyond this many image sizes are taken as being there.
+const FARTHEST: f64 = 1e60;
 
 /// Angle between two directions of any length, radians in 0..π: by the arc tangent, which keeps its digits where the
 /// angle is small and the arc cosine has none.
@@ -131,6 +136,22 @@ mod tests {
         let e = |x, y| Display::default().eccentricity_rad((160, 96), gaze, x, y);
         assert_eq!(e(0.25, 0.75), 0.0);
         assert!(e(0.25 + 1e-9, 0.75) > 1e-10);
+    }
+
+    #[test]
+    fn gazes_however_far_have_a_direction() {
+        let display = Display::default();
+        let e = |x: f64, at: f64| {
+            let gaze = Gaze::new(x, 0.5).unwrap();
+            display.eccentricity_rad((160, 96), gaze, at, 0.5).to_degrees()
+        };
+        for x in [1e12, 1e154, 1e200, f64::MAX] {
+            // To an eye that looks straight to the right, edges of 90 degrees are 45 and 135 degrees away.
+            for (at, expected) in [(1.0, 45.0), (0.5, 90.0), (0.0, 135.0)] {
+                assert!((e(x, at) - expected).abs() < 1e-9, "{x} {at}: {}", e(x, at));
+                assert!((e(-x, 1.0 - at) - expected).abs() < 1e-9);
+            }
+        }
     }
 
     #[test]

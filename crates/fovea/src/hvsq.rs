@@ -137,7 +137,7 @@ impl Hvsq {
             Pooling::Uniform { size_px } if size_px > width.min(height) as f64 => Err(Error::parameter(
                 "pooling size",
                 size_px,
-                format!("at most {} pixels, the shorter side of the image", width.min(height)),
+                format!("at most {} pixels, the shorter side of the image as it is enlarged", width.min(height)),
             )),
             _ => Ok(()),
         }
@@ -226,6 +226,9 @@ impl HvsqReference {
                 found: vec![labels.len()],
                 expected: vec![size.0 * size.1],
             });
+        }
+        if num_regions == 0 {
+            return Ok(Vec::new());
         }
         let regions = Regions::new(labels, size, num_regions);
         #[cfg(feature = "gpu")]

@@ -74,7 +74,9 @@ impl GazePooling {
     /// Level of detail of a pooling size: log₂ of it, at least 0.
     pub fn level_of_detail(pooling_px: f64) -> f64 {
         // The published program adds 1e-6 where others would take a maximum; the golden data hold it.
-        (1e-6 + pooling_px).log2().max(0.0)
+        let lod = (1e-6 + pooling_px).log2();
+        // What is no number stays none.
+        if lod < 0.0 { 0.0 } else { lod }
     }
 }
 

@@ -107,7 +107,7 @@ impl PlainPooling {
             .map(|i| {
                 let (x, y) = (i % width, i / width);
                 let r = self.radius_px(x, y);
-                let range = |at: usize, n: usize| (at.saturating_sub(r), (at + r + 1).min(n));
+                let range = |at: usize, n: usize| (at.saturating_sub(r), at.saturating_add(r).saturating_add(1).min(n));
                 Window { columns: range(x, width), rows: range(y, height) }
             })
             .collect();

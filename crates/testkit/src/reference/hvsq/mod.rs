@@ -1,4 +1,4 @@
-//! HVSQ once more, in float64 and as plainly as possible: what the fast one is judged by.
+//! HVSQ once more, in float64 and as plainly as possible: what the fast one is judged by, in float64 as well.
 //!
 //! Written from the specification: whole maps, every tap of every filter, every sample of every pool, no adjoints. Images
 //! are planes of channels, `[3, height, width]`, encoded RGB.

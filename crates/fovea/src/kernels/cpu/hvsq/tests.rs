@@ -338,3 +338,36 @@ fn minimising_hvsq_leads_to_its_reference() {
     let ratio = first.unwrap() / last;
     assert!(ratio >= 50.0, "only {ratio} times");
 }
+
+/// The kernel in float64 against the plain program of the specification, pools of fractional sizes and odd images included.
+#[test]
+fn kernel_in_float64_is_the_plain_reference() {
+    use gazesplat_testkit::reference::hvsq as plain;
+    let bank = FilterBank::sp5();
+    let plain_bank = plain::Bank { low: *bank.low(), high: *bank.high(), bands: bank.bands().to_vec() };
+    for size in [(64, 32), (45, 37), (70, 97)] {
+        let n = size.0 * size.1 * 3;
+        let (reference, image) = (noise(21, n), noise(22, n));
+        let planes =
+            |data: &[f64]| [0, 1, 2].map(|c| plain::Plane::new(size.0, size.1, |x, y| data[3 * (y * size.0 + x) + c]));
+        let (a, b) = (planes(&image), planes(&reference));
+        for distance in [Distance::Mse, Distance::L1] {
+            let plain_distance = if distance == Distance::Mse { plain::Distance::Mse } else { plain::Distance::L1 };
+            let check = |pooling: Pooling, plain_pooling: plain::Pooling, bound: f64| {
+                let found = value(&plan::<f64>(size, pooling, distance), &reference, &image);
+                let expected = plain::hvsq(&a, &b, &plain_bank, &plain_pooling, plain_distance);
+                let error = (found / expected - 1.0).abs();
+                assert!(error < bound, "{size:?} {pooling:?} {distance:?}: {found:e} {expected:e}, off by {error:e}");
+            };
+            for p in [1.0, 1.5, 2.0, 2.5, 3.0, 7.3, 12.0, 29.7] {
+                check(uniform(p), plain::Pooling::Uniform(p), 1e-10);
+            }
+            let width = 2.0 * 50f64.to_radians().tan();
+            for gaze_at in [[0.5, 0.5], [0.2, 0.9], [3.0, -2.0]] {
+                let plain_gaze = plain::Gaze { width, gaze: gaze_at, alpha: 0.4, end_points: false };
+                // The arc cosine of the plain program has half of the digits near the gaze.
+                check(gaze(gaze_at[0], gaze_at[1]), plain::Pooling::Gaze(plain_gaze), 1e-7);
+            }
+        }
+    }
+}

@@ -180,6 +180,30 @@ fn looking_at_every_step_changes_no_bit() {
     }
 }
 
+/// Colours so bright that the limits end where f32 does: a pixel then stops by the floor, and every tile ends in its list.
+#[test]
+fn colors_beyond_all_limits_end_every_tile() {
+    let draw = Draw { n: 400, size: [50, 37], log_scale: [-0.5, 0.5], opacity: [0.99, 0.9999], ..Draw::default() };
+    let mut scene = random(77, draw);
+    scene.options.stats = StatsMode::All;
+    for (i, coefficient) in scene.cloud.sh.iter_mut().enumerate() {
+        *coefficient = coefficient.map(|v| if i % 3 == 0 { v.abs() * 1e38 } else { v });
+    }
+    for gamma in [1e-6, 1.0] {
+        let lut = table(4, 8).with_gamma(gamma).expect("legal").with_residual(Residual::Centre);
+        let scene = with(&scene, lut);
+        for (name, device) in devices() {
+            let frame = scene.frame_on(&device);
+            let tiles = &frame.splat_stats.tiles;
+            assert!(tiles.num_pairs.iter().any(|&n| n > 50), "lists are long");
+            let within = tiles.num_pairs_used.iter().zip(&tiles.num_pairs).all(|(used, n)| used <= n);
+            assert!(within, "{name}, γ {gamma}: {:?} of {:?}", tiles.num_pairs_used, tiles.num_pairs);
+            assert!(frame.stats.num_pairs_used < frame.stats.num_pairs, "{name}: pixels do stop");
+            assert!(frame.image.iter().all(|v| !v.is_nan()), "{name}, γ {gamma}");
+        }
+    }
+}
+
 #[test]
 fn frames_do_not_depend_on_the_counters_asked_for() {
     for scene in dense() {
@@ -251,6 +275,7 @@ crate::common::on_gpu!(
     frames_with_tables_are_those_of_the_reference,
     gamma_zero_is_the_fixed_rule_bit_for_bit,
     looking_at_every_step_changes_no_bit,
+    colors_beyond_all_limits_end_every_tile,
     frames_do_not_depend_on_the_counters_asked_for,
     blends_fall_with_gamma_and_never_exceed_the_fixed_rule,
     pixels_that_work_through_their_list_keep_the_background,

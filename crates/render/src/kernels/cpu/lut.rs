@@ -73,11 +73,15 @@ pub(super) fn tile_lut<'a>(options: &'a RasterOptions, lists: &TileLists<'_>, id
     }
 }
 
-/// Whether the fixed rule at `t_stop` can stop a pixel that the table does not: it was asked for, or the table admits
+/// Whether the fixed rule at `options.t_stop` can stop a pixel that the table does not: it was asked for, or the table admits
 /// transmittances so small that f32 ends.
-pub(super) fn needs_fixed(lut: &TerminationLut, t_stop: f32) -> bool {
-    // One splat takes a pixel down to a 10⁻⁴th, and c_max divides the limits: there is room between 10⁻¹⁵ and the floor.
-    t_stop > T_FLOOR || lut.smallest_limit() < 1e-15
+pub(super) fn needs_fixed(lut: &TerminationLut, options: &RasterOptions, lists: &TileLists<'_>) -> bool {
+    let color_max = match lut.color_max() {
+        ColorMax::One => 1.0,
+        ColorMax::Tile => lists.color_max.iter().chain(&options.background).copied().fold(1.0, f32::max),
+    };
+    // One splat takes a pixel down to a 10⁻⁴th: between 10⁻¹⁵ and the floor there is room for the last.
+    options.t_stop > T_FLOOR || lut.smallest_limit() / color_max < 1e-15
 }
 
 /// Values of T·c_max above which no pixel of a row can stop.
@@ -140,8 +144,8 @@ fn look_up<S: Simd>(
         return stop;
     }
     // Channels never shrink: from here on a colour meets the entries only that lie ahead of its cell along the axes on which
-    // all that is left leads out of it, and that of its cell alone where there is no such axis. Neighbours come down together, so that the whole row learns of it,
-    // as far as what is left is less than what `limits_ahead` covers.
+    // all that is left leads out of it, and that of its cell alone where there is no such axis. Neighbours come down
+    // together, so that the whole row learns of it, as far as what is left is less than what `limits_ahead` covers.
     let reach = s.mul(left, s.splat(lut.reach));
     let near_enough = s.gt(s.splat(lut.ahead), s.mul(reach, size));
     let stay = s.and_not(s.gt_where(near_enough, t, s.splat(0.0)), stop);

@@ -105,6 +105,7 @@ pub fn rasterize(
     let counts_blends = level == StatsLevel::All;
     let mut blends = vec![0; if counts_blends { width * height } else { 0 }];
     let splats = &raster_splats(splats);
+    let with_fixed = options.lut.as_ref().is_some_and(|lut| needs_fixed(lut, options, lists));
     let mut tile_stats = vec![Vec::new(); lists.grid.tiles_y as usize];
     // A missing plane is cut into empty strips, so that all planes zip.
     let strip = |plane: usize| TILE * width * plane;
@@ -118,8 +119,8 @@ pub fn rasterize(
         .zip(tile_stats.par_iter_mut())
         .map(|((((((tile_y, image), final_t), stop), blends), tile_ends), pair_stats)| {
             let strip = Strip { splats, lists, options, tile_y, image, final_t, stop, blends, tile_ends, pair_stats };
-            if let Some(lut) = &options.lut {
-                return match (needs_fixed(lut, options.t_stop), level, options.depth) {
+            if options.lut.is_some() {
+                return match (with_fixed, level, options.depth) {
                     (false, StatsLevel::Dominance, _) => dispatch(ForwardStrip::<false, 1, false, LUT_ALONE>(strip)),
                     (false, StatsLevel::All, _) => dispatch(ForwardStrip::<false, 2, false, LUT_ALONE>(strip)),
                     (false, StatsLevel::None, false) => dispatch(ForwardStrip::<false, 0, false, LUT_ALONE>(strip)),

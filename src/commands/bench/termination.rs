@@ -136,6 +136,8 @@ fn study(args: &StudyArgs, flip: Flip, device: &ComputeDevice, console: &Console
     let all = args.split.views(&load_scene(&args.scene, &config, console)?, &args.scene)?;
     let num = args.views.unwrap_or(all.len()).min(all.len());
     let views: Vec<View> = (0..num).map(|i| all[i * all.len() / num].clone()).collect();
+    // A table that cannot be used is refused before hours of work depend on it.
+    let given = if args.termination.is_given() { Some(args.termination.termination()?) } else { None };
     let bench = Bench {
         splats: Splats::from_cloud(&model.cloud, device.tensors())?,
         images: ImageCache::new(views.clone(), config.data.cache_bytes),
@@ -153,7 +155,7 @@ fn study(args: &StudyArgs, flip: Flip, device: &ComputeDevice, console: &Console
     rules.push(table_rule("naive, quality of paper", constant(&paper)?, matched)?);
     let (_, wanted) = bench.quality(&Termination::Lut(strict.clone()))?;
     let matched = bench.matched(&constant(&strict)?, |_, blends| blends > wanted)?;
-    rules.push(table_rule("naive, work of strict", constant(&strict)?, matched)?);
+    rules.push(table_rule("naive, blends of strict", constant(&strict)?, matched)?);
     let same_work = constant(&strict)?.with_gamma(matched)?;
     // The one constant that no colour may see: the smallest limit of all.
     rules.push(table_rule("naive, bound of strict", smallest(&strict)?, 1.0)?);
@@ -162,8 +164,12 @@ fn study(args: &StudyArgs, flip: Flip, device: &ComputeDevice, console: &Console
             rules.push(table_rule(name, table.clone(), gamma)?);
         }
     }
-    if args.termination.is_given() {
-        rules.push(("given".to_owned(), args.termination.gamma, args.termination.termination()?));
+    if let Some(given) = given {
+        let gamma = match &given {
+            Termination::Fixed(_) => None,
+            Termination::Lut(lut) => Some(lut.gamma()),
+        };
+        rules.push(("given".to_owned(), gamma, given));
     }
     let mut rows = bench.measure(&rules)?;
     bench.time(&mut rows, args.repeats)?;

@@ -186,6 +186,25 @@ impl PruneTerms {
 }
 
 impl HvsqBound {
+    /// Checks that the photographs of `views` are not smaller than the pools, if this is a bound.
+    ///
+    /// # Errors
+    /// Naming the first that is.
+    pub fn check_views(&self, views: &[View]) -> Result<()> {
+        if self.at_most == 0.0 {
+            return Ok(());
+        }
+        let hvsq = Hvsq::new(Pooling::Uniform { size_px: self.pooling_px }, Distance::Mse)?;
+        for view in views {
+            let pinhole = view.camera.intrinsics;
+            hvsq.check_size((pinhole.width as usize, pinhole.height as usize)).map_err(|error| {
+                Failure::new(format!("`guard.hvsq.pooling_px` and the photograph `{}`: {error}", view.name))
+                    .hint("choose other pools, or another size of the images with `data.max_side`")
+            })?;
+        }
+        Ok(())
+    }
+
     /// `guard` with this bound, if it is one.
     ///
     /// # Errors

@@ -21,7 +21,8 @@ const REGION_EDGES_DEG: [f64; 3] = [18.0, 27.0, 33.0];
 #[derive(Debug, Clone, Default, Args)]
 pub struct HvsqArgs {
     /// Measure HVSQ over square pools of these sizes in pixels, at least 1 each [without a list: 1,3,7,12]
-    #[arg(long, value_name = "SIZES", num_args = 0..=1, default_missing_value = "1,3,7,12", value_delimiter = ',')]
+    #[arg(long, value_name = "SIZES", num_args = 0..=1, default_missing_value = "1,3,7,12", value_delimiter = ',',
+        value_parser = parse_size)]
     pub hvsq: Option<Vec<f64>>,
     /// Measure HVSQ for an eye that looks at this point: 0.5,0.5 is the centre, 0,0 the upper left corner
     #[arg(long, value_name = "X,Y", value_parser = parse_gaze, allow_hyphen_values = true)]
@@ -36,6 +37,13 @@ pub struct HvsqArgs {
     /// last size
     #[arg(long, value_name = "FILE")]
     pub hvsq_map: Option<PathBuf>,
+}
+
+fn parse_size(text: &str) -> std::result::Result<f64, String> {
+    text.trim().parse().map_err(|_| {
+        "expected sizes in pixels such as 1,3,7,12; what is no size stands before `--hvsq` or behind another option"
+            .to_owned()
+    })
 }
 
 fn parse_gaze(text: &str) -> std::result::Result<Gaze, String> {
@@ -57,10 +65,14 @@ impl HvsqArgs {
     /// When a pool is impossible.
     pub fn measures(&self) -> Result<Option<Measures>> {
         let wants_any = self.gaze.is_some() || self.hvsq_regions || self.hvsq_map.is_some();
+        if self.display_fov.is_some() && self.gaze.is_none() && !self.hvsq_regions {
+            return Err(Failure::new("`--display-fov` has no meaning for pools of one size")
+                .hint("say where the eye looks with `--gaze X,Y`, or ask for `--hvsq-regions`"));
+        }
         let sizes = match &self.hvsq {
             Some(sizes) => sizes.clone(),
             None if self.gaze.is_some() => Vec::new(),
-            None if wants_any || self.display_fov.is_some() => default_sizes(),
+            None if wants_any => default_sizes(),
             None => return Ok(None),
         };
         let display = self.display_fov.unwrap_or_default();

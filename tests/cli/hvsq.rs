@@ -71,6 +71,10 @@ fn impossible_comparisons_are_refused() {
     assert!(said.contains("pooling size: found 65, expected at most 64 pixels"), "{said}");
     let said = place.run(&["hvsq", "a.png", "missing.png"]).refused();
     assert!(said.contains("missing.png"), "{said}");
+    let said = place.run(&["hvsq", "a.png", "b.png", "--display-fov", "100"]).refused();
+    assert!(said.contains("no meaning for pools of one size") && said.contains("--gaze X,Y"), "{said}");
+    let ended = place.run(&["hvsq", "--hvsq", "a.png", "b.png"]);
+    assert!(ended.code == 2 && ended.stderr.contains("what is no size stands before `--hvsq`"), "{}", ended.stderr);
     for bad in [["--gaze", "0.5"], ["--gaze", "NaN,0"], ["--display-fov", "171"], ["--display-fov", "0"]] {
         let ended = place.run(&[&["hvsq", "a.png", "b.png"][..], &bad[..]].concat());
         assert_eq!(ended.code, 2, "{bad:?}");

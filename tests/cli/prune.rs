@@ -111,6 +111,33 @@ fn killed_run_is_gone_on_with_to_the_same_end() {
     assert!(said.contains("the run in it is finished"), "{said}");
 }
 
+#[cfg(unix)]
+#[test]
+fn interrupt_leaves_a_checkpoint_and_says_how_to_go_on() {
+    use std::process::{Command, Stdio};
+    let place = Place::with_run();
+    let child = Command::new(assert_cmd::cargo::cargo_bin!("gazesplat"))
+        .args(["prune", "run", "--scene", "scene", "--out", "out", "--budget", "50"])
+        .current_dir(place.path("."))
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    // The first checkpoint shows that the loop runs; a budget of 50 takes hours.
+    let checkpoint = place.path("out/checkpoint.safetensors");
+    for _ in 0..3000 {
+        if checkpoint.is_file() {
+            break;
+        }
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    let status = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+    let output = child.wait_with_output().expect("ends");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(status.success() && output.status.success(), "{said}");
+    assert!(said.contains("go on with the same command and `--out out --resume`"), "{said}");
+    assert!(checkpoint.is_file() && !place.path("out/point_cloud.ply").exists());
+}
+
 #[test]
 fn studies_write_their_tables_and_plots() {
     let place = Place::with_run();
@@ -144,6 +171,9 @@ fn wrong_input_is_refused_with_a_reason() {
     assert!(!place.path("none").exists(), "nothing is left behind");
     let said = place.run(&["prune", "run", "--scene", "scene", "--quality", "x"]).stderr;
     assert!(said.contains("expected h, m, l, or a share"), "{said}");
+    let pools = ["--set", "guard.hvsq.at_most=1", "--set", "guard.hvsq.pooling_px=65"];
+    let said = prune(&place, &[&["--out", "none"], pools.as_slice()].concat()).refused();
+    assert!(said.contains("`guard.hvsq.pooling_px` and the photograph"), "{said}");
     let said = prune(&place, &["--out", "none", "--set", "guard.hvsq.at_most=1e-12"]);
     assert!(said.code == 2 && said.stderr.contains("hvsq@3 of at most 1.000e-12"), "{}", said.stderr);
     let said = place.run(&["prune", "run", "--scene", "scene", "--out", "run", "--overwrite"]).refused();

@@ -108,6 +108,7 @@ pub(crate) fn with_terms(
 ) -> Result<Pruner> {
     let (loss, bound) = (config.guard.loss, terms.guard.hvsq.clone());
     bound.add_to(Guard::default())?;
+    bound.check_views(&stage.split.guard)?;
     let mut pruner = pruner.with_guard(Box::new(move |reference, basis| {
         bound.add_to(basis.guard(reference, loss)).expect("its settings have been checked")
     }));

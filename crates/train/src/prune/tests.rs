@@ -357,6 +357,56 @@ fn reference_below_the_guard_is_said_at_once() {
 }
 
 #[test]
+fn reference_that_is_no_number_is_refused() {
+    let measured = |psnr| Measured {
+        points: 100,
+        psnr,
+        ssim: 0.5,
+        pairs_per_tile: 1.0,
+        pairs_used_per_tile: 1.0,
+        ws: 0.0,
+        render_ms: 1.0,
+        passed: true,
+    };
+    let message = guard::check_reference(&measured(f64::NAN)).expect_err("refused").to_string();
+    assert!(message.contains("NaN dB and an SSIM of 0.5: nothing can be held against it"), "{message}");
+    guard::check_reference(&measured(30.0)).expect("a number");
+}
+
+/// A step whose loss is no number names the view; the best state and the last checkpoint stay usable.
+#[test]
+fn loss_that_is_no_number_leaves_the_best_state_and_the_checkpoint() {
+    let dir = tempfile::tempdir().expect("temporary directory");
+    let path = dir.path().join("checkpoint");
+    let (config, device) = (config(), cpu_device());
+    let mut pruner = pruner(&config, &device);
+    while pruner.iteration() < 3 {
+        pruner.advance().expect("it runs");
+    }
+    pruner.save(&path, Noted::default()).expect("writable");
+    let best = pruner.result().expect("a CPU answers");
+    struct Broken;
+    impl crate::losses::ImageLoss for Broken {
+        fn evaluate(&self, image: burn::tensor::Tensor<3>, _: &LossTarget) -> crate::losses::ImageLossValue {
+            let loss = image.sum().mul_scalar(f32::NAN);
+            crate::losses::ImageLossValue { terms: loss.clone().inner(), loss, names: &["broken"] }
+        }
+    }
+    pruner.add_loss(1.0, Box::new(Broken));
+    let error = loop {
+        match pruner.advance() {
+            Ok(Progress::Finished(_)) => panic!("it must fail"),
+            Ok(_) => {}
+            Err(error) => break error,
+        }
+    };
+    assert!(matches!(&error, Error::NonFiniteLoss { view, .. } if !view.is_empty()), "{error}");
+    assert_eq!(pruner.result().expect("a CPU answers"), best);
+    let (resumed, _) = Pruner::resume(&job(&config, &SCENE.cloud, &device), &path).expect("readable");
+    assert_eq!(resumed.result().expect("a CPU answers"), best);
+}
+
+#[test]
 fn judges_that_see_nothing_of_the_model_are_refused() {
     let (config, device) = (config(), cpu_device());
     let mut away = SCENE.dataset.train[0].clone();

@@ -124,12 +124,14 @@ impl LutArgs {
             };
         }
         if let Some(space) = self.space {
-            spec.space = match space {
+            let space = match space {
                 SpaceName::Srgb => ColorSpace::Srgb,
                 SpaceName::Linear => ColorSpace::Linear,
             };
-            // Only the paper's own choice applies a table for one space to another.
-            spec.read_as = spec.space;
+            // Only the paper's own choice applies a table for one space to another: naming it again changes nothing.
+            if space != spec.space {
+                (spec.space, spec.read_as) = (space, space);
+            }
         }
         if let Some(sample) = self.sample {
             spec.sample = match sample {

@@ -104,6 +104,8 @@ fn a_table_for_linear_light_is_refused_unless_it_is_the_papers() {
     assert!(render("linear.json").refused().contains("linear light"));
     place.run(&["lut", "--preset", "paper", "--out", "paper.json"]).done();
     render("paper.json").done();
+    place.run(&["lut", "--preset", "paper", "--space", "linear", "--out", "named.json"]).done();
+    assert_eq!(place.read("named.json"), place.read("paper.json"), "naming a preset's own space changes nothing");
 }
 
 #[test]

@@ -101,6 +101,12 @@ impl RenderOptions {
             "background",
             format!("{:?}", self.background),
             "three finite values",
+        )?;
+        check(
+            matches!(self.termination, Termination::Fixed(_)) || self.background.iter().all(|&c| c >= 0.0),
+            "background",
+            format!("{:?} with a termination table", self.background),
+            "no negative channel: a table bounds what is hidden from 0 upwards",
         )
     }
 }

@@ -260,6 +260,9 @@ fn passes_with_gradients_and_linear_tables_are_refused() {
     assert!(scene.refusal(&options).is_some_and(|e| e.to_string().contains("gradients")));
     options.pass = gazesplat_render::Pass::Inference;
     assert!(scene.refusal(&options).is_none());
+    options.background[1] = -0.1;
+    assert!(scene.refusal(&options).is_some_and(|e| e.to_string().contains("no negative channel")));
+    options.background[1] = 0.0;
     // Also where the model is tracked, whatever the options say.
     let tracked = gazesplat_render::Splats::from_cloud(&scene.cloud, &crate::common::device().autodiff())
         .expect("fits")

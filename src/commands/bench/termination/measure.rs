@@ -109,22 +109,24 @@ impl Bench<'_> {
         Ok(rows)
     }
 
-    /// Times every rule: frame by frame one after the other, so that a busy moment of the machine meets all alike.
+    /// Times every rule: frame by frame one after the other, so that a busy moment of the machine meets all alike. Every
+    /// round begins with another rule: none always follows the same one, whose memory and caches it would inherit.
     pub fn time(&self, rows: &mut [Row], repeats: usize) -> Result<()> {
         let bar = progress::counting_bar(self.console, "timing", self.views.len() * repeats);
         let mut ratios = vec![Vec::new(); rows.len()];
         for view in &self.views {
             let mut times = vec![Vec::with_capacity(repeats); rows.len()];
-            for _ in 0..repeats {
-                for (row, times) in rows.iter().zip(&mut times) {
-                    let options = self.options(&row.termination, StatsMode::None);
+            for round in 0..repeats {
+                for position in 0..rows.len() {
+                    let rule = (round + position) % rows.len();
+                    let options = self.options(&rows[rule].termination, StatsMode::None);
                     let start = Instant::now();
                     let frame = render(&self.splats, &view.camera, &options)?;
                     if self.is_gpu {
                         // Work on a GPU is queued: reading the image waits for it.
                         rgb(frame)?;
                     }
-                    times.push(1e3 * start.elapsed().as_secs_f64());
+                    times[rule].push(1e3 * start.elapsed().as_secs_f64());
                 }
                 let vanilla = times[0][times[0].len() - 1];
                 for (ratios, times) in ratios.iter_mut().zip(&times) {

@@ -94,6 +94,13 @@ fn tile_rows(splat: &[f32; lane::COUNT], grid: &TileGrid) -> Range<u32> {
     indices(tiles_touched(mean - extent, mean + extent, grid.height as f32, grid.tiles_y as f32))
 }
 
+/// The largest channel of a splat if it exceeds 1, else 0.
+#[inline(always)]
+fn above_one(splat: &[f32; lane::COUNT]) -> f32 {
+    let largest = splat[lane::RED..lane::RED + 3].iter().copied().fold(1.0, f32::max);
+    if largest > 1.0 { largest } else { 0.0 }
+}
+
 /// A span of tiles as indices.
 #[inline(always)]
 fn indices(span: TileSpan) -> Range<u32> {
@@ -129,8 +136,15 @@ const CHUNK: usize = 1024;
 /// [`Error::Limit`] if there are more pairs than indices.
 pub fn bin(splats: &ProjectedSplats, grid: TileGrid, extras: BinExtras) -> Result<TileLists<'static>> {
     let rows = splats.rows();
-    // 1. Rows of tiles per splat; one entry each.
-    let tile_row_ranges: Vec<Range<u32>> = rows.par_iter().with_min_len(CHUNK).map(|s| tile_rows(s, &grid)).collect();
+    // 1. Rows of tiles per splat, one entry each; and its largest channel while its lanes are at hand.
+    let (mut tile_row_ranges, mut brightness) = (Vec::new(), Vec::new());
+    let chunks = rows.par_iter().with_min_len(CHUNK);
+    match extras.color_max {
+        true => {
+            chunks.map(|s| (tile_rows(s, &grid), above_one(s))).unzip_into_vecs(&mut tile_row_ranges, &mut brightness);
+        }
+        false => chunks.map(|s| tile_rows(s, &grid)).collect_into_vec(&mut tile_row_ranges),
+    }
     let mut entry_offsets = Vec::with_capacity(rows.len() + 1);
     let (mut num_entries, mut num_pairs_box) = (0u64, 0u64);
     entry_offsets.push(0usize);
@@ -221,12 +235,6 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, extras: BinExtras) -> Resul
     // Rows of tiles write interleaved records, each exactly once: atomics keep that safe and cost a plain store.
     let record_pairs: Vec<AtomicU32> =
         (0..if extras.records { num_pairs } else { 0 }).map(|_| AtomicU32::new(0)).collect();
-    let is_bright: Vec<bool> = match extras.color_max {
-        true => {
-            rows.par_iter().with_min_len(CHUNK).map(|s| s[lane::RED..lane::RED + 3].iter().any(|&c| c > 1.0)).collect()
-        }
-        false => Vec::new(),
-    };
     let mut color_max = vec![0.0f32; if extras.color_max { grid.len() } else { 0 }];
     let maxima = split_at_offsets(
         &mut color_max,
@@ -237,9 +245,9 @@ pub fn bin(splats: &ProjectedSplats, grid: TileGrid, extras: BinExtras) -> Resul
         let mut cursors = starts.to_vec();
         for &e in list.iter() {
             let entry = entries[e as usize];
-            // Most splats stay below 1: their lanes, which are far apart in memory, are not read.
-            if extras.color_max && is_bright[entry.splat as usize] {
-                let largest = rows[entry.splat as usize][lane::RED..lane::RED + 3].iter().copied().fold(0.0, f32::max);
+            // Most splats stay below 1.
+            let largest = if extras.color_max { brightness[entry.splat as usize] } else { 0.0 };
+            if largest > 0.0 {
                 for maximum in &mut maxima[entry.first_tile as usize..entry.end_tile.max(entry.first_tile) as usize] {
                     *maximum = maximum.max(largest);
                 }

@@ -126,12 +126,12 @@ fn the_study_compares_every_rule() {
     assert_eq!(place.list("study"), files);
     let rows: serde_json::Value = serde_json::from_str(&ended.stdout).expect("JSON");
     let rows = rows.as_array().expect("rows");
-    assert_eq!(rows.len(), 17);
+    assert_eq!(rows.len(), 23);
     let csv = place.read("study/termination.csv");
     let columns = "rule,gamma,psnr,ssim,psnr_to_full,delta_e_max,delta_e_p999,above_one,flip,flip_p999,blends_per_pixel,\
                    lane_pixels_per_pixel,ms,speed_up";
     assert_eq!(csv.lines().next(), Some(columns));
-    assert_eq!(csv.lines().count(), 18);
+    assert_eq!(csv.lines().count(), 24);
     for row in rows {
         let number = |key: &str| row[key].as_f64().unwrap_or_else(|| panic!("{key}: {row}"));
         assert!((0.0..=1.0).contains(&number("flip")) && number("flip") <= number("flip_p999"), "{row}");

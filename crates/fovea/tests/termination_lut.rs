@@ -224,6 +224,7 @@ fn trials(lut: &TerminationLut, trials: u64) -> (f64, u64, u64) {
             let (mut worst, mut above, mut stopped) = (0.0_f64, 0, 0);
             for _ in 0..1000 {
                 let (de, is_stopped) = difference(&front(&mut rng), lut);
+                assert!(de.is_finite(), "a pixel is no number");
                 worst = worst.max(de);
                 above += u64::from(de > 1.0);
                 stopped += u64::from(is_stopped);

@@ -21,7 +21,7 @@ use gazesplat_core::color::ColorSpace;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_fovea::flip::{Flip, PIXELS_PER_DEGREE};
 use gazesplat_fovea::termination_lut::LutSpec;
-use gazesplat_render::{Splats, Termination, TerminationLut};
+use gazesplat_render::{Residual, Splats, Termination, TerminationLut};
 use measure::Bench;
 use serde::Serialize;
 use std::path::PathBuf;
@@ -73,6 +73,9 @@ pub struct StudyArgs {
 
 /// γ of the study (JND Sec. 5).
 const GAMMAS: [f32; 6] = [0.5, 1.0, 2.0, 5.0, 10.0, 20.0];
+
+/// Fixed transmittances beside the usual one.
+const CONSTANTS: [f32; 4] = [0.002, 0.004, 0.008, 0.016];
 
 /// Values of ΔE₀₀ of which the shares of pixels above are told.
 pub(super) const THRESHOLDS: [f64; 10] = [0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0, 2.0];
@@ -159,6 +162,14 @@ fn study(args: &StudyArgs, flip: Flip, device: &ComputeDevice, console: &Console
     let same_work = constant(&strict)?.with_gamma(matched)?;
     // The one constant that no colour may see: the smallest limit of all.
     rules.push(table_rule("naive, bound of strict", smallest(&strict)?, 1.0)?);
+    // One transmittance without a table, as cheap as a rule can be: what the tables meet at equal speed.
+    for t in CONSTANTS {
+        rules.push((format!("fixed {t}"), None, Termination::Fixed(t)));
+    }
+    // What the centred residual costs and gains: the bounded table of the paper's, and the mean one without a bound.
+    let dropping = LutSpec { residual: Residual::Drop, ..LutSpec::strict() }.build()?;
+    rules.push(table_rule("strict, residual dropped", dropping, 1.0)?);
+    rules.push(table_rule("strict, residual of the mean", strict.clone().with_residual(Residual::Mean), 1.0)?);
     for (name, table) in [("strict", &strict), ("paper", &paper)] {
         for gamma in GAMMAS {
             rules.push(table_rule(name, table.clone(), gamma)?);

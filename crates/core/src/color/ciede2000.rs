@@ -58,7 +58,7 @@ pub(super) fn hue(a: f64, b: f64) -> f64 {
     if h < 0.0 { h + TAU } else { h }
 }
 
-/// ΔE₀₀ of two Lab colours. Symmetric; 0 for equal colours.
+/// ΔE₀₀ of two Lab colours. Symmetric; 0 for equal colours; NaN where a coordinate is.
 pub fn delta_e(lab1: DVec3, lab2: DVec3) -> f64 {
     // 1. Chroma and hue with the stretched a axis (Eq. 2–7).
     let g = stretch(0.5 * (lab1.y.hypot(lab1.z) + lab2.y.hypot(lab2.z)));
@@ -86,8 +86,9 @@ pub fn delta_e(lab1: DVec3, lab2: DVec3) -> f64 {
     // 4. Weighted sum (Eq. 22).
     let w = weights(0.5 * (lab1.x + lab2.x), 0.5 * (c1 + c2), mean_hue);
     let (l, c, h) = (dl / w.s_l, dc / w.s_c, dh / w.s_h);
-    // Rounding may leave −1e-16 where the rotation term cancels.
-    (l * l + c * c + h * h + w.r_t * c * h).max(0.0).sqrt()
+    // Rounding may leave −1e-16 where the rotation term cancels; a maximum with 0 would hide NaN.
+    let squared = l * l + c * c + h * h + w.r_t * c * h;
+    if squared < 0.0 { 0.0 } else { squared.sqrt() }
 }
 
 #[cfg(test)]
@@ -98,6 +99,15 @@ mod tests {
     fn grey_differences_are_those_of_lightness_alone() {
         // At L̄ = 50 the weight of lightness is 1.
         assert!((delta_e(DVec3::new(49.0, 0.0, 0.0), DVec3::new(51.0, 0.0, 0.0)) - 2.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_is_no_colour_differs_by_no_number() {
+        let grey = DVec3::new(50.0, 0.0, 0.0);
+        for broken in [DVec3::new(f64::NAN, 0.0, 0.0), DVec3::new(50.0, f64::NAN, 0.0), DVec3::new(50.0, 1.0, f64::NAN)]
+        {
+            assert!(delta_e(grey, broken).is_nan() && delta_e(broken, grey).is_nan(), "{broken}");
+        }
     }
 
     #[test]

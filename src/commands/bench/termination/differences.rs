@@ -34,9 +34,10 @@ impl Differences {
         Self { bins: vec![0; num_bins], per_unit, largest: 0.0, sum: 0.0, num: 0 }
     }
 
-    /// Adds some.
+    /// Adds some. What is no number counts as larger than all that are: an image with a hole is not like another.
     pub fn add(&mut self, differences: &[f64]) {
         for &d in differences {
+            let d = if d.is_nan() { f64::INFINITY } else { d };
             let bin = ((d * self.per_unit) as usize).min(self.bins.len() - 1);
             self.bins[bin] += 1;
             self.largest = self.largest.max(d);
@@ -78,14 +79,15 @@ pub(super) fn differences(a: &ImageF32, b: &ImageF32) -> Vec<f64> {
     pixels.map(|(p, q)| if p == q { 0.0 } else { delta_e(lab(p), lab(q)) }).collect()
 }
 
-/// PSNR of two images of one size, clamped to 0…1; at most [`metrics::MAX_PSNR_DB`].
+/// PSNR of two images of one size, clamped to 0…1; at most [`metrics::MAX_PSNR_DB`], and NaN where a pixel is.
 pub(super) fn psnr_between(a: &ImageF32, b: &ImageF32) -> f64 {
     let squares = a.data.iter().zip(&b.data).map(|(p, q)| {
         let d = f64::from(p.clamp(0.0, 1.0)) - f64::from(q.clamp(0.0, 1.0));
         d * d
     });
     let mse = squares.sum::<f64>() / a.data.len().max(1) as f64;
-    (-10.0 * mse.log10()).min(metrics::MAX_PSNR_DB)
+    let psnr = -10.0 * mse.log10();
+    if psnr > metrics::MAX_PSNR_DB { metrics::MAX_PSNR_DB } else { psnr }
 }
 
 #[cfg(test)]
@@ -99,6 +101,16 @@ mod tests {
         assert_eq!(all.largest, 9.99);
         assert!((all.exceeded_by(0.1) - 9.0).abs() < 0.02);
         assert!((all.above(5.0) - 0.5).abs() < 0.002);
+    }
+
+    #[test]
+    fn a_pixel_that_is_no_number_is_not_overlooked() {
+        let image = ImageF32 { width: 1, height: 1, data: vec![0.1, 0.5, 0.2] };
+        let broken = ImageF32 { data: vec![0.1, f32::NAN, 0.2], ..image.clone() };
+        let mut all = Differences::of_delta_e();
+        all.add(&differences(&image, &broken));
+        assert_eq!((all.largest, all.above(1.0)), (f64::INFINITY, 1.0));
+        assert!(psnr_between(&image, &broken).is_nan());
     }
 
     #[test]

@@ -8,12 +8,16 @@ use crate::progress;
 use gazesplat_core::View;
 use gazesplat_core::image::ImageF32;
 use gazesplat_core::io::images::ImageCache;
+use gazesplat_core::rng::Rng;
 use gazesplat_fovea::flip::Flip;
 use gazesplat_render::{RenderOptions, RenderStats, Splats, StatsMode, Termination, TerminationLut, render};
 use gazesplat_train::evaluate::rgb;
 use gazesplat_train::losses::LossTarget;
 use gazesplat_train::metrics;
 use std::time::Instant;
+
+/// Seed of the order in which rules are timed.
+const ORDER_SEED: u64 = 0x006f_7264_6572;
 
 /// What the rules are measured on.
 pub(super) struct Bench<'a> {
@@ -56,7 +60,8 @@ impl Bench<'_> {
         Ok((psnr / self.views.len() as f64, blended as f64 / self.num_pixels()))
     }
 
-    /// The γ at which `table` turns from more than wanted to less, by bisection of its logarithm.
+    /// The γ at which `table` turns from more than wanted to less, by bisection of its logarithm; the nearer end of the
+    /// interval, said aloud, when it does neither inside.
     pub fn matched(&self, table: &TerminationLut, is_more: impl Fn(f64, f64) -> bool) -> Result<f32> {
         let (mut low, mut high) = (1e-3_f32, 1e2_f32);
         let bar = progress::counting_bar(self.console, "matching", 14);
@@ -71,6 +76,9 @@ impl Bench<'_> {
             bar.inc(1);
         }
         bar.finish_and_clear();
+        if low == 1e-3 || high == 1e2 {
+            self.console.note("no γ of 0.001 to 100 matches: the row named after the match is only the nearest");
+        }
         Ok((low * high).sqrt())
     }
 
@@ -110,23 +118,30 @@ impl Bench<'_> {
     }
 
     /// Times every rule: frame by frame one after the other, so that a busy moment of the machine meets all alike. Every
-    /// round begins with another rule: none always follows the same one, whose memory and caches it would inherit.
+    /// round has an order of its own, so that no rule always inherits the memory and caches of the same other; the
+    /// first of each view, which meets a cold machine, does not count.
     pub fn time(&self, rows: &mut [Row], repeats: usize) -> Result<()> {
         let bar = progress::counting_bar(self.console, "timing", self.views.len() * repeats);
         let mut ratios = vec![Vec::new(); rows.len()];
+        let (mut rng, mut order) = (Rng::new(ORDER_SEED), (0..rows.len()).collect::<Vec<_>>());
         for view in &self.views {
             let mut times = vec![Vec::with_capacity(repeats); rows.len()];
-            for round in 0..repeats {
-                for position in 0..rows.len() {
-                    let rule = (round + position) % rows.len();
+            for round in 0..=repeats {
+                rng.shuffle(&mut order);
+                for &rule in &order {
                     let options = self.options(&rows[rule].termination, StatsMode::None);
                     let start = Instant::now();
                     let frame = render(&self.splats, &view.camera, &options)?;
                     if self.is_gpu {
-                        // Work on a GPU is queued: reading the image waits for it.
-                        rgb(frame)?;
+                        // Work on a GPU is queued: reading one pixel waits for it.
+                        frame.image.slice([0..1, 0..1]).into_data();
                     }
-                    times[rule].push(1e3 * start.elapsed().as_secs_f64());
+                    if round > 0 {
+                        times[rule].push(1e3 * start.elapsed().as_secs_f64());
+                    }
+                }
+                if round == 0 {
+                    continue;
                 }
                 let vanilla = times[0][times[0].len() - 1];
                 for (ratios, times) in ratios.iter_mut().zip(&times) {

@@ -75,7 +75,11 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
         ("quality_over_gamma.svg", "Quality against the photographs", "γ", "PSNR, dB", &over_gamma),
     ] {
         let curve = |prefix: &str, color: [u8; 3]| {
-            let rows = results.rows.iter().filter(|r| r.rule.starts_with(prefix));
+            let is_of = |rule: &str| match prefix {
+                "strict" => rule == prefix,
+                _ => rule.starts_with(prefix),
+            };
+            let rows = results.rows.iter().filter(|r| is_of(&r.rule));
             // Rules of one name at several γ are a curve; the naive ones are constants of their own.
             let width = if prefix == "naive" { 0 } else { 2 };
             Curve { points: rows.filter_map(value).collect(), color, opacity: 1.0, width, dots: true }
@@ -84,7 +88,7 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
             ("strict", curve("strict", [0, 114, 178])),
             ("paper", curve("paper", [213, 94, 0])),
             ("naive", curve("naive", [110, 110, 110])),
-            ("fixed 1e-4", curve("fixed", [0, 158, 115])),
+            ("fixed", curve("fixed", [0, 158, 115])),
             ("given", curve("given", [204, 121, 167])),
         ];
         if let Some(svg) = svg(&Plot { title, x, y, curves: &curves }) {

@@ -57,7 +57,7 @@ pub(crate) fn write_pngs(
         if let Some(depth) = depth {
             let stem = file.strip_suffix(".png").unwrap_or(file);
             let (height, width) = (image.height as usize, image.width as usize);
-            io::write_atomically(&dir.join(format!("{stem}_depth.npy")), |out| {
+            io::write_atomically(dir.join(format!("{stem}_depth.npy")), |out| {
                 npy::write_f32(out, &depth, height, width)
             })?;
         }

@@ -23,7 +23,7 @@ fn scenes() -> impl Iterator<Item = (u64, Scene)> {
             _ => Draw { n: 2000, size: [64, 64], log_scale: [-3.5, -2.0], sh_degree, ..Draw::default() },
         };
         let mut scene = random(7000 + seed, draw);
-        scene.options.depth = seed % 3 != 0;
+        scene.options.depth = !seed.is_multiple_of(3);
         scene.options.antialiased = case >= 40;
         scene.options.stats = StatsMode::All;
         if seed % 4 == 3 {

@@ -13,6 +13,7 @@
 use crate::diagnostics::{Failure, Result};
 use crate::json_lines::JsonLines;
 use gazesplat_core::GaussianCloud;
+use gazesplat_core::io::model::ANTIALIASED_COMMENT;
 use serde::Serialize;
 use std::fs;
 use std::io::Write;
@@ -171,12 +172,13 @@ impl RunDir {
         Ok(gazesplat_core::io::ply::save_with_comments(self.model_path(), cloud, &comments)?)
     }
 
-    /// Writes `unfinished.ply`.
+    /// Writes `unfinished.ply`, with the comment of a model that is trained for antialiased rendering.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub(crate) fn write_unfinished(&self, cloud: &GaussianCloud) -> Result<()> {
-        Ok(gazesplat_core::io::ply::save(self.unfinished_path(), cloud)?)
+    pub(crate) fn write_unfinished(&self, cloud: &GaussianCloud, antialiased: bool) -> Result<()> {
+        let comments: Vec<String> = antialiased.then(|| ANTIALIASED_COMMENT.to_owned()).into_iter().collect();
+        Ok(gazesplat_core::io::ply::save_with_comments(self.unfinished_path(), cloud, &comments)?)
     }
 
     /// Removes `unfinished.ply`, when the model itself is there.

@@ -63,6 +63,13 @@ pub fn command(args: &ConvertArgs, console: &Console) -> Result<()> {
     }
     refuse_existing(&args.out, args.overwrite)?;
     let mut model = Model::load(&args.model, console)?;
+    if format == ModelFormat::Splat && model.report.is_antialiased() {
+        console.warn(format_args!(
+            "`.splat` has no place to say that the model was trained for antialiased rendering: draw `{}` with \
+             `--antialiased`",
+            args.out.display()
+        ));
+    }
     if model.cloud.is_empty() {
         return Err(Failure::new(format!("`{}` holds no Gaussian", model.path.display()))
             .hint("the model is empty or all its values are broken: export or train it again"));

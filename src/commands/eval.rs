@@ -1,5 +1,6 @@
 //! `gazesplat eval`: how close a model comes to the photographs of a scene.
 
+use super::antialiased::AntialiasedArgs;
 use super::device::ComputeDevice;
 use super::hvsq_args::{self, HvsqArgs, Measured, Measures};
 use super::quality::{self, ImageFiles};
@@ -27,10 +28,11 @@ Examples:
   gazesplat eval runs/fox-1 --scene fox --min-psnr 25 || echo worse than 25 dB
   gazesplat eval runs/fox-1 --scene fox --save-images looks
   gazesplat eval runs/fox-1 --scene fox --device gpu
+  gazesplat eval runs/fox-1 --scene fox --antialiased --set data.max_side=240
   gazesplat eval runs/fox-1 --scene fox --hvsq 1,3,7,12 --gaze 0.5,0.5
 
-A run is measured with the settings it was trained with (image size, split, background), a PLY
-file with the defaults.
+A run is measured with the settings it was trained with (image size, split, background,
+antialiasing), a PLY file with the defaults.
 
 Gaussians with a value that is not finite are left out, with a warning that names the file and
 their number; a model without any other is refused.")]
@@ -49,6 +51,9 @@ pub struct EvalArgs {
     /// When a pixel stops
     #[command(flatten)]
     pub termination: TerminationArgs,
+    /// Antialiasing
+    #[command(flatten)]
+    pub antialiased: AntialiasedArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -78,7 +83,8 @@ pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
 
 fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
     let model = Model::load_for_drawing(&args.model, console)?;
-    let config = model.settings(&args.settings)?;
+    let mut config = model.settings(&args.settings)?;
+    config.model.antialiased = args.antialiased.or(config.model.antialiased);
     let dataset = load_scene(&args.scene, &config, console)?;
     let measures = args.hvsq.measures()?;
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);

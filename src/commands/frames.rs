@@ -1,11 +1,11 @@
-//! Renders as 8-bit frames, and where they go: a directory of PNG files or one video.
+//! Renders as 8-bit frames, and where they go: a directory of PNG files, with depth maps beside them, or one video.
 
 use crate::diagnostics::{Failure, Result};
 use crate::run_dir::create_all;
-use crate::y4m;
+use crate::{npy, y4m};
 use gazesplat_core::{Camera, RgbImage8, io};
 use gazesplat_render::{RenderOptions, RenderStats, Splats};
-use gazesplat_train::evaluate::rgb;
+use gazesplat_train::evaluate::{expected_depth, rgb};
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -19,11 +19,31 @@ pub(crate) fn draw(splats: &Splats, camera: &Camera, options: &RenderOptions) ->
     Ok((rgb(rendered)?.to_rgb8(), stats))
 }
 
-/// Writes the frame of every camera into `<stem>.png` below `dir`.
+/// As [`draw`]; with the expected depth, `[H, W]` in world units, if the options ask for it.
+pub(crate) fn draw_with_depth(
+    splats: &Splats,
+    camera: &Camera,
+    options: &RenderOptions,
+) -> Result<(Frame, RenderStats)> {
+    let rendered = gazesplat_render::render(splats, camera, options)?;
+    let stats = rendered.stats;
+    let depth = expected_depth(&rendered)?;
+    Ok((Frame { image: rgb(rendered)?.to_rgb8(), depth }, stats))
+}
+
+/// What is written of one camera.
+pub(crate) struct Frame {
+    /// The colours.
+    pub image: RgbImage8,
+    /// The expected depth, `[H, W]` in world units.
+    pub depth: Option<Vec<f32>>,
+}
+
+/// Writes the frame of every camera into `<stem>.png` below `dir`, and its depth into `<stem>_depth.npy`.
 pub(crate) fn write_pngs(
     dir: &Path,
     cameras: &[NamedCamera],
-    mut frame: impl FnMut(&NamedCamera) -> Result<RgbImage8>,
+    mut frame: impl FnMut(&NamedCamera) -> Result<Frame>,
 ) -> Result<()> {
     let files = png_names(cameras)?;
     if dir.is_file() {
@@ -32,7 +52,15 @@ pub(crate) fn write_pngs(
     }
     create_all(dir)?;
     for (file, camera) in files.iter().zip(cameras) {
-        io::save_png(dir.join(file), &frame(camera)?)?;
+        let Frame { image, depth } = frame(camera)?;
+        io::save_png(dir.join(file), &image)?;
+        if let Some(depth) = depth {
+            let stem = file.strip_suffix(".png").unwrap_or(file);
+            let (height, width) = (image.height as usize, image.width as usize);
+            io::write_atomically(dir.join(format!("{stem}_depth.npy")), |out| {
+                npy::write_f32(out, &depth, height, width)
+            })?;
+        }
     }
     Ok(())
 }

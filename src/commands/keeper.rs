@@ -22,6 +22,8 @@ pub(crate) struct Kept {
     pub step: u32,
     /// The model.
     pub cloud: GaussianCloud,
+    /// Whether it is trained for antialiased rendering.
+    pub antialiased: bool,
 }
 
 /// An observer whose files can be brought up to date between two steps.
@@ -102,9 +104,10 @@ impl Keeper<'_> {
                 return Ok(outcome);
             }
             if is_due(copy_every, step) {
-                let copy = Kept { step, cloud: trainer.to_cloud()? };
+                let antialiased = trainer.config().model.antialiased;
+                let copy = Kept { step, cloud: trainer.to_cloud()?, antialiased };
                 // Drivers have been seen to end the process.
-                if let Err(failure) = self.run_dir.write_unfinished(&copy.cloud) {
+                if let Err(failure) = self.run_dir.write_unfinished(&copy.cloud, antialiased) {
                     tracing::error!("no copy of step {step}: {failure}");
                 }
                 *kept = Some(copy);

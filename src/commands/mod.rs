@@ -15,6 +15,7 @@ pub mod synth;
 pub mod termination;
 pub mod train;
 
+mod antialiased;
 mod checkpoints;
 mod devices;
 mod frames;
@@ -184,7 +185,7 @@ impl Model {
         Ok(model)
     }
 
-    /// Settings for working with this model: those of its run, if it was given as one, under those of the command line.
+    /// Settings for working with this model: those of [`Model::run_settings`] under those of the command line.
     ///
     /// # Errors
     /// When a settings file or value is wrong.
@@ -192,15 +193,24 @@ impl Model {
         layered(self.run_settings()?, args)?.resolve()
     }
 
-    /// The settings of its run, if it was given as one; else none.
+    /// The settings of its run, if it was given as one; else what its file says: whether it is to be drawn antialiased.
     ///
     /// # Errors
     /// When the settings file is wrong.
     pub fn run_settings(&self) -> Result<Settings> {
         match self.run.as_ref().map(RunDir::settings_path).filter(|p| p.is_file()) {
             Some(file) => Settings::new().with_file(&file),
+            None if self.report.is_antialiased() => antialiased::with(Settings::new(), true),
             None => Ok(Settings::new()),
         }
+    }
+
+    /// Whether it was trained for antialiased rendering, by its run or its file.
+    ///
+    /// # Errors
+    /// As [`Model::run_settings`].
+    pub fn is_antialiased(&self) -> Result<bool> {
+        Ok(self.run_settings()?.resolve()?.model.antialiased)
     }
 }
 

@@ -5,6 +5,7 @@ mod files;
 mod outcome;
 pub(super) mod stage;
 
+use super::antialiased::{AntialiasedArgs, carried_to_pruning};
 use super::device::ComputeDevice;
 use super::{Model, log_machine, scene_name};
 use crate::cli::DeviceArgs;
@@ -12,7 +13,7 @@ use crate::console::{Console, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::interrupt;
 use crate::progress::TrainProgress;
-use crate::settings::{self, PRUNE, Settings};
+use crate::settings::{self, Settings};
 use crate::terms::PruneTerms;
 use clap::Args;
 use files::PruneDir;
@@ -64,6 +65,9 @@ pub struct PruneArgs {
     /// Directory for the run [default: runs/SCENE-pruned-N]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
+    /// Antialiasing
+    #[command(flatten)]
+    pub antialiased: AntialiasedArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -106,7 +110,7 @@ pub fn command(args: &PruneArgs, console: &Console) -> Result<()> {
 
 /// Settings: those of the model's run where both have them, the preset, the file, `--set`, and the options on top.
 fn resolved(args: &PruneArgs, recorded: &Settings) -> Result<(PruneConfig, PruneTerms)> {
-    let mut settings = recorded.carried_to(&PRUNE, &["data", "render"]);
+    let mut settings = carried_to_pruning(recorded)?;
     if let Some(preset) = &args.preset {
         settings = settings.with_config(preset.as_ref())?;
     }
@@ -120,7 +124,7 @@ fn resolved(args: &PruneArgs, recorded: &Settings) -> Result<(PruneConfig, Prune
     if let Some(loss) = args.quality {
         settings = settings.with_override(&format!("guard.loss={loss:?}"))?;
     }
-    settings.resolve_pruning()
+    args.antialiased.over(settings)?.resolve_pruning()
 }
 
 /// Whether both paths lead to the same directory.

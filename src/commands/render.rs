@@ -1,5 +1,6 @@
 //! `gazesplat render`: a model seen from the cameras of a scene or along a path, as PNG files or a video.
 
+use super::antialiased::AntialiasedArgs;
 use super::device::ComputeDevice;
 use super::frames::{self, NamedCamera};
 use super::termination::TerminationArgs;
@@ -28,7 +29,16 @@ Examples:
   gazesplat render runs/fox-1 --scene fox --split test --out frames
   gazesplat render model.ply --path orbit.json --size 1280x720 --out orbit.y4m --device gpu
   gazesplat render model.ply --scene fox --termination jnd --out frames
+  gazesplat render model.ply --scene fox --antialiased --size 320x180 --out small
+  gazesplat render model.ply --scene fox --depth --out frames    numpy.load('frames/0001_depth.npy')
   ffmpeg -i orbit.y4m -crf 16 orbit.mp4
+
+--depth writes NumPy arrays of 32-bit floats, [height, width]: for each pixel the depth along the
+viewing axis (camera z, not distance) in world units, each Gaussian weighted by what is seen of it,
+and 0 where none is seen. `transforms.json` of nerfstudio takes such files as `depth_file_path`.
+
+--antialiased draws as gsplat and nerfstudio do with `antialiased`. A model that says so itself, by
+its run, the PLY comment `SplatRenderMode: mip` or the flag of SPZ, is drawn so without asking.
 
 A .y4m video is raw: YUV 4:4:4, 8 bit, BT.709, limited range. Players and encoders read it as it is.
 
@@ -65,6 +75,12 @@ pub struct RenderArgs {
     /// When a pixel stops
     #[command(flatten)]
     pub termination: TerminationArgs,
+    /// Antialiasing
+    #[command(flatten)]
+    pub antialiased: AntialiasedArgs,
+    /// Write the expected depth of every view beside its image, `<image stem>_depth.npy`
+    #[arg(long)]
+    pub depth: bool,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -82,6 +98,10 @@ pub struct RenderArgs {
 /// When the device cannot be used, the model, the cameras or an option is wrong, or the frames cannot be written.
 pub fn command(args: &RenderArgs, console: &Console) -> Result<()> {
     let target = Target::new(args)?;
+    if let (true, Target::Video(file)) = (args.depth, &target) {
+        return Err(Failure::new(format!("`{}` is a video, which holds no depth", file.display()))
+            .hint("name a directory with `--out`: `--depth` writes a file per view beside its image"));
+    }
     args.termination.check()?;
     let device = ComputeDevice::open(args.device.device, console)?;
     render(args, &target, &device, console)
@@ -97,6 +117,8 @@ fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &
     options.alpha_max = args.alpha_max.unwrap_or(options.alpha_max);
     options.near = args.near.unwrap_or(options.near);
     options.background = args.background.unwrap_or(options.background);
+    options.antialiased = args.antialiased.or(options.antialiased);
+    options.depth = args.depth;
     options.stats = if args.stats { StatsMode::All } else { StatsMode::None };
     options.termination = args.termination.termination()?;
     options.validate()?;
@@ -124,15 +146,15 @@ fn render(args: &RenderArgs, target: &Target, device: &ComputeDevice, console: &
     let mut stats: Vec<(String, RenderStats)> = Vec::new();
     device.guard(|| {
         let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-        let frame = |camera: &NamedCamera| {
-            let (image, counters) = frames::draw(&splats, &camera.1, &options)?;
+        let mut frame = |camera: &NamedCamera| {
+            let (drawn, counters) = frames::draw_with_depth(&splats, &camera.1, &options)?;
             stats.push((camera.0.clone(), counters));
             bar.inc(1);
-            Ok(image)
+            Ok(drawn)
         };
         match target {
             Target::Pngs(dir) => frames::write_pngs(dir, &cameras, frame),
-            Target::Video(file) => frames::write_video(file, &cameras, fps, frame),
+            Target::Video(file) => frames::write_video(file, &cameras, fps, |camera| Ok(frame(camera)?.image)),
         }
     })?;
     bar.finish_and_clear();

@@ -6,7 +6,7 @@ use super::checkpoints::{Checkpoints, Resumed};
 use super::device::ComputeDevice;
 use super::keeper::{Keeper, Kept};
 use super::record::Recorder;
-use super::{Model, layered, load_scene, log_machine, quality, scene_name};
+use super::{Model, antialiased, layered, load_scene, log_machine, quality, scene_name};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, duration, grouped};
 use crate::diagnostics::{Failure, Result};
@@ -18,6 +18,7 @@ use crate::settings::{self, Settings};
 use crate::terms::TermSection;
 use clap::Args;
 use gazesplat_core::io::images::ImageCache;
+use gazesplat_core::io::model::ANTIALIASED_COMMENT;
 use gazesplat_core::{Dataset, GaussianCloud};
 use gazesplat_fovea::hvsq::ReferenceCache;
 use gazesplat_render::Splats;
@@ -35,6 +36,7 @@ Examples:
   gazesplat train my_capture --config quick
   gazesplat train my_capture --set train.steps=3000 --set data.max_side=480 --out runs/small
   gazesplat train my_capture --config my.toml --set train.seed=1
+  gazesplat train my_capture --set model.antialiased=true
   gazesplat train my_capture --device gpu
   gazesplat train my_capture --init runs/my_capture-1 --config finetune --set loss.hvsq.weight=100
   gazesplat train my_capture --out runs/mine --resume
@@ -72,10 +74,17 @@ pub struct TrainArgs {
 /// # Errors
 /// When the scene, the settings, the device or the directory cannot be used, or the training fails.
 pub fn command(args: &TrainArgs, console: &Console) -> Result<()> {
-    let settings = layered(Settings::new(), &args.settings)?;
-    let (config, terms) = (settings.resolve()?, settings.resolve_terms()?);
+    let mut settings = layered(Settings::new(), &args.settings)?;
+    settings.resolve()?;
     let device = &ComputeDevice::open(args.device.device, console)?;
     let init = args.init.as_deref().map(|path| Model::load_to_train(path, console)).transpose()?;
+    if let Some(model) = &init
+        && model.is_antialiased()?
+    {
+        // It is trained on as what it was trained for, unless the settings say otherwise.
+        settings = layered(antialiased::with(Settings::new(), true)?, &args.settings)?;
+    }
+    let (config, terms) = (settings.resolve()?, settings.resolve_terms()?);
     let (out, overwrite) = (args.out.as_deref(), args.overwrite);
     let resume = args.resume;
     let job = TrainJob { scene: &args.scene, config, terms, init, out, overwrite, device, resume, is_resumable: true };
@@ -246,7 +255,11 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     let (outcome, cloud) = match (ended, latest) {
         (Ok(outcome), Ok(cloud)) => (outcome, cloud),
         (Err(failure), Ok(cloud)) if !cloud.is_empty() => {
-            return Err(salvage(failure, &run_dir, Some(Kept { step: num_steps, cloud })));
+            return Err(salvage(
+                failure,
+                &run_dir,
+                Some(Kept { step: num_steps, cloud, antialiased: config.model.antialiased }),
+            ));
         }
         (Err(failure), _) | (Ok(_), Err(failure)) => return Err(salvage(failure, &run_dir, kept)),
     };
@@ -346,7 +359,7 @@ fn preload(images: &ImageCache, console: &Console) -> Result<()> {
 
 /// A training that failed half-way keeps its last good model, under a name that no one takes for a finished one.
 fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
-    let Some(Kept { step, cloud }) = last.filter(|kept| kept.step > 0 && !kept.cloud.is_empty()) else {
+    let Some(Kept { step, cloud, antialiased }) = last.filter(|kept| kept.step > 0 && !kept.cloud.is_empty()) else {
         return failure;
     };
     let path = run_dir.unfinished_path();
@@ -354,7 +367,7 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
         Some((_, path)) => failure.hint_first(format!("`--resume` goes on from `{}`", path.display())),
         None => failure,
     };
-    match run_dir.write_unfinished(&cloud) {
+    match run_dir.write_unfinished(&cloud, antialiased) {
         Ok(()) => failure.hint_first(format!("the model as it was after step {step} is in `{}`", path.display())),
         Err(_) => failure,
     }
@@ -363,7 +376,7 @@ fn salvage(failure: Failure, run_dir: &RunDir, last: Option<Kept>) -> Failure {
 /// Where a model comes from, for the header of its file. The frame is that of the reconstruction; the extent is what
 /// learning rates and distances were measured in. Nothing of the machine and no time: equal runs give equal files.
 fn provenance(job: &TrainJob<'_>, dataset: &Dataset, num_steps: u32) -> Vec<String> {
-    vec![
+    let mut lines = vec![
         format!("Scene: {}, {}", scene_name(job.scene), dataset.source),
         format!(
             "Trained: {num_steps} steps, seed {}, on {} views; {} test views{}",
@@ -373,7 +386,9 @@ fn provenance(job: &TrainJob<'_>, dataset: &Dataset, num_steps: u32) -> Vec<Stri
             held_out(dataset)
         ),
         format!("Extent of the cameras: {} world units", dataset.scene_extent()),
-    ]
+    ];
+    lines.extend(job.config.model.antialiased.then(|| ANTIALIASED_COMMENT.to_owned()));
+    lines
 }
 
 fn facts(
@@ -431,11 +446,12 @@ mod tests {
         let dir = tempfile::tempdir().expect("temporary directory");
         let run_dir = RunDir::create(dir.path(), false).expect("writable");
         let lost = || Failure::from(gazesplat_render::Error::Device { message: "device lost".to_owned() });
-        for nothing in [None, Some(Kept { step: 0, cloud: one_gaussian() })] {
+        for nothing in [None, Some(Kept { step: 0, cloud: one_gaussian(), antialiased: false })] {
             salvage(lost(), &run_dir, nothing);
             assert!(!run_dir.unfinished_path().exists(), "a model without a step is none");
         }
-        let report = salvage(lost(), &run_dir, Some(Kept { step: 20, cloud: one_gaussian() })).report(false);
+        let report =
+            salvage(lost(), &run_dir, Some(Kept { step: 20, cloud: one_gaussian(), antialiased: false })).report(false);
         assert_eq!(ply::load(run_dir.unfinished_path()).expect("readable"), one_gaussian());
         assert!(report.contains("hint: the model as it was after step 20 is in `"), "{report}");
         assert!(report.contains("unfinished.ply`; what was saved is intact; free memory of the card"), "{report}");

@@ -2,6 +2,7 @@
 //!
 //! One binary for all commands, so that the scene and the run most tests start from are made once.
 
+mod antialiased;
 mod bad_input;
 mod convert;
 mod demo;

@@ -52,6 +52,7 @@ fn gpu_passes(c: &mut Criterion) {
         width: camera.intrinsics.width,
         height: camera.intrinsics.height,
         near: NEAR,
+        antialiased: false,
     };
     let grid = TileGrid::new(view.width, view.height);
     let buffer = |values: &[f32]| gpu.upload_u32(bytemuck::cast_slice(values), &[values.len()]);

@@ -49,6 +49,7 @@ fn view(camera: &Camera) -> ViewSpec {
         width: camera.intrinsics.width,
         height: camera.intrinsics.height,
         near: NEAR,
+        antialiased: false,
     }
 }
 

@@ -9,6 +9,7 @@
 
 pub mod backend;
 pub mod cluster;
+pub mod depth;
 pub mod device;
 pub mod error;
 #[cfg(feature = "gpu")]

@@ -42,8 +42,12 @@ pub struct RenderOptions {
     pub background: [f32; 3],
     /// SH degree evaluated, at most the degree stored; `None` = all that is stored.
     pub sh_degree: Option<u32>,
-    /// Adds a fifth channel, Σ T α z: depth weighted by what is seen of it, world units.
+    /// Adds a fifth channel, Σ T α z: depth weighted by what is seen of it, world units; see
+    /// [`crate::Rendered::expected_depth`].
     pub depth: bool,
+    /// Opacities are lowered by what the dilation adds to the area of their footprints, so that a model looks alike at every
+    /// distance and resolution (Yu 2024, the 2D Mip filter). For models that were trained so; default false.
+    pub antialiased: bool,
     /// Counters to fill.
     pub stats: StatsMode,
     /// What the frame is for.
@@ -59,6 +63,7 @@ impl Default for RenderOptions {
             background: [0.0; 3],
             sh_degree: None,
             depth: false,
+            antialiased: false,
             stats: StatsMode::None,
             pass: Pass::Inference,
         }

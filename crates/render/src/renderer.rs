@@ -129,6 +129,7 @@ fn frame(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Fr
             width: camera.intrinsics.width,
             height: camera.intrinsics.height,
             near: options.near,
+            antialiased: options.antialiased,
         },
         raster: RasterOptions {
             alpha_max: options.alpha_max,

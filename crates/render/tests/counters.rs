@@ -14,9 +14,9 @@ fn counted(scene: &Scene) -> (Frame, SplatStats) {
     (frame, stats)
 }
 
-/// Scenes of every kind: sparse, dense, opaque, tiny and wide Gaussians.
+/// Scenes of every kind: sparse, dense, opaque, tiny and wide Gaussians; the last fifty antialiased.
 fn scenes() -> impl Iterator<Item = (u64, Scene)> {
-    (0..200).map(|seed| {
+    (0..250).map(|seed| {
         let draw = match seed % 5 {
             0 => Draw::default(),
             1 => Draw { n: 150, size: [64, 48], opacity: [0.3, 0.999], ..Draw::default() },
@@ -24,7 +24,9 @@ fn scenes() -> impl Iterator<Item = (u64, Scene)> {
             3 => Draw { n: 200, size: [70, 70], log_scale: [-7.0, -3.0], ..Draw::default() },
             _ => Draw { n: 60, size: [17, 90], log_scale: [-5.0, 0.5], stray: 0.4, ..Draw::default() },
         };
-        (seed, random(seed, draw))
+        let mut scene = random(seed, draw);
+        scene.options.antialiased = seed >= 200;
+        (seed, scene)
     })
 }
 

@@ -56,10 +56,17 @@ fn compare(what: &str, scene: &Scene, gradients: &Gradients, mut expected: &[f64
 
 /// Differences of Σ upstream · image of the float64 reference.
 fn reference_gradient(scene: &Scene, upstream: &[f32], step: f64) -> Vec<f64> {
+    let channels = scene.channels();
+    differences(scene, step, |frame| {
+        crate::common::interleaved(frame, channels).iter().zip(upstream).map(|(v, &w)| v * f64::from(w)).sum()
+    })
+}
+
+/// Differences of `loss` of the frame of the float64 reference, in the order of [`flatten`].
+pub fn differences(scene: &Scene, step: f64, loss: impl Fn(&reference::Frame) -> f64) -> Vec<f64> {
     let (gaussians, camera, options) =
         (scene.reference_gaussians(), scene.reference_camera(), scene.reference_options());
     let (n, k) = (gaussians.len(), gaussians.num_coefficients);
-    let channels = scene.channels();
     let mut loss = |x: &[f64]| {
         let mut x = x;
         let x = &mut x;
@@ -71,8 +78,7 @@ fn reference_gradient(scene: &Scene, upstream: &[f32], step: f64) -> Vec<f64> {
             num_coefficients: k,
             sh: rows(x, n * k),
         };
-        let frame = reference::render(&moved, &camera, &options);
-        crate::common::interleaved(&frame, channels).iter().zip(upstream).map(|(v, &w)| v * f64::from(w)).sum()
+        loss(&reference::render(&moved, &camera, &options))
     };
     let x: Vec<f64> = flatten(&scene.cloud).into_iter().map(f64::from).collect();
     (0..x.len()).map(|i| central(&mut loss, &x, i, step)).collect()
@@ -80,7 +86,7 @@ fn reference_gradient(scene: &Scene, upstream: &[f32], step: f64) -> Vec<f64> {
 
 /// The true derivative of the hard-cut renderer, from float64: steps so small that no pixel crosses a branch.
 #[track_caller]
-fn check_against_reference(what: &str, scene: &Scene, seed: u64, tolerance: f64) {
+pub fn check_against_reference(what: &str, scene: &Scene, seed: u64, tolerance: f64) {
     let mut upstream = upstream(seed, scene);
     let channels = scene.channels();
     for (pixel, _) in scene.reference().fragile.iter().enumerate().filter(|(_, f)| **f) {
@@ -103,9 +109,10 @@ fn smooth(seed: u64) -> Scene {
 
 #[test]
 fn smooth_cutoff_gradients_equal_differences_of_the_renderer() {
-    for seed in 0..4 {
+    for (seed, antialiased) in [(0, false), (1, false), (2, false), (3, false), (0, true), (1, true)] {
         let mut scene = smooth(seed);
         scene.options.pass = Pass::SmoothCutoff;
+        scene.options.antialiased = antialiased;
         let weights = upstream(seed, &scene);
         let (_, gradients) = scene.frame_and_gradients(&weights);
         let mut probe = scene.clone();

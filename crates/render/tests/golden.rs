@@ -26,9 +26,7 @@ pub fn covered() -> Vec<(Golden, Scene)> {
     let mut covered = Vec::new();
     for file in files {
         let golden = file.load();
-        let reason = if golden.json["antialiased"].as_bool() == Some(true) {
-            "antialiased: the renderer has no such mode yet"
-        } else if golden.number("eps2d").is_some_and(|e| e != 0.3) {
+        let reason = if golden.number("eps2d").is_some_and(|e| e != 0.3) {
             "another dilation than 0.3"
         } else {
             let scene = scene(&golden);
@@ -75,6 +73,7 @@ pub fn scene(golden: &Golden) -> Scene {
         background: golden.f32("in.background").try_into().expect("the background is RGB"),
         sh_degree: Some(number("sh_degree") as u32),
         depth: true,
+        antialiased: golden.json["antialiased"].as_bool().unwrap_or(false),
         ..RenderOptions::default()
     };
     Scene { cloud, camera: Camera { intrinsics, camera_from_world }, options }
@@ -191,6 +190,40 @@ fn golden_images_are_within_five_yardsticks() {
     }
 }
 
+/// Expected depth against `out.depth_expected`. Accumulated depth d and alpha a may each be off by five yardsticks, so their
+/// quotient e by 5 (y_d + e y_a) / a to first order.
+#[test]
+fn golden_expected_depths_are_as_exact_as_what_they_are_quotients_of() {
+    for (golden, scene) in covered() {
+        let fragile = fragile(&golden, &scene);
+        let yardstick = |key: &str| {
+            let found = golden.json["yardstick_torch_f32_vs_f64"][key].as_f64();
+            found.unwrap_or_else(|| panic!("{}: no yardstick of {key}", golden.stem))
+        };
+        let (of_depth, of_alpha) = (yardstick("depth_acc"), yardstick("alpha"));
+        let (expected, alpha) = (golden.f64("out.depth_expected"), golden.f64("out.alpha"));
+        let found = scene.expected_depth();
+        gazesplat_testkit::close::assert_finite(&golden.stem, &found);
+        assert_eq!(found.len(), expected.len(), "{}", golden.stem);
+        let mut worst = 0.0f64;
+        for (pixel, (found, expected)) in found.iter().zip(&expected).enumerate() {
+            if fragile[pixel] {
+                continue;
+            }
+            if alpha[pixel] == 0.0 {
+                assert_eq!(*found, 0.0, "{}: nothing is seen in pixel {pixel}", golden.stem);
+                continue;
+            }
+            // The quotient itself is rounded to float32.
+            let bound = YARDSTICKS * (of_depth + expected * of_alpha) / alpha[pixel] + 6e-8 * expected;
+            let error = (f64::from(*found) - expected).abs();
+            worst = worst.max(error / bound);
+            assert!(error <= bound, "{}, pixel {pixel}: {found}, expected {expected} ± {bound:.1e}", golden.stem);
+        }
+        println!("{:24} expected depth: at most {worst:.2} of the bound", golden.stem);
+    }
+}
+
 #[test]
 fn golden_gradients_are_within_five_yardsticks() {
     let records = covered();
@@ -261,6 +294,7 @@ fn golden_projections_equal_the_oracle() {
             width: scene.camera.intrinsics.width,
             height: scene.camera.intrinsics.height,
             near: scene.options.near,
+            antialiased: scene.options.antialiased,
         };
         let projected = project(&slices, &view, None);
         let valid = golden.bool("proj.valid");
@@ -295,6 +329,7 @@ fn golden_projections_equal_the_oracle() {
 
 crate::common::on_gpu!(
     golden_images_are_within_five_yardsticks,
+    golden_expected_depths_are_as_exact_as_what_they_are_quotients_of,
     golden_gradients_are_within_five_yardsticks,
     golden_scenes_bound_the_error_of_float32,
     golden_images_do_not_depend_on_the_pass,

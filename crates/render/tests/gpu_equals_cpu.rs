@@ -6,9 +6,11 @@ use gazesplat_testkit::{Tolerance, assert_close};
 use crate::common::scenes::{Draw, random, upstream};
 use crate::common::{Frame, Gradients, Scene, is_on_gpu, sturdy, with_gpu};
 
-/// Sparse, dense, opaque, tiny, wide and thin; every SH degree; with and without depth; odd sizes.
+/// Sparse, dense, opaque, tiny, wide and thin; every SH degree; with and without depth; odd sizes; then the
+/// first sixteen once more, antialiased.
 fn scenes() -> impl Iterator<Item = (u64, Scene)> {
-    (0..40).map(|seed| {
+    (0..56).map(|case: u64| {
+        let seed = case % 40;
         let sh_degree = (seed % 5) as u32;
         let draw = match seed % 8 {
             0 => Draw { sh_degree, ..Draw::default() },
@@ -21,7 +23,8 @@ fn scenes() -> impl Iterator<Item = (u64, Scene)> {
             _ => Draw { n: 2000, size: [64, 64], log_scale: [-3.5, -2.0], sh_degree, ..Draw::default() },
         };
         let mut scene = random(7000 + seed, draw);
-        scene.options.depth = seed % 3 != 0;
+        scene.options.depth = !seed.is_multiple_of(3);
+        scene.options.antialiased = case >= 40;
         scene.options.stats = StatsMode::All;
         if seed % 4 == 3 {
             scene.options.termination = Termination::Fixed(0.0);
@@ -129,8 +132,10 @@ fn one_adapter_gives_the_same_bits_twice() {
 }
 
 /// Files whose test bodies all run on both processors.
-const ON_BOTH: [(&str, &str); 9] = [
+const ON_BOTH: [(&str, &str); 11] = [
+    ("antialiased", include_str!("antialiased.rs")),
     ("counters", include_str!("counters.rs")),
+    ("depth", include_str!("depth.rs")),
     ("determinism", include_str!("determinism.rs")),
     ("finite_diff", include_str!("finite_diff.rs")),
     ("golden", include_str!("golden.rs")),

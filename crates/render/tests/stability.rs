@@ -9,22 +9,37 @@ use gazesplat_testkit::{Rng, Tolerance, assert_close};
 use crate::common::scenes::{Draw, camera, empty_cloud, logit, options, push, push_disc, random, scene, upstream};
 use crate::common::{Gradients, Scene, interleaved, sturdy};
 
-/// Renders with random upstream gradients and asserts that everything is finite.
-#[track_caller]
-fn finite(what: &str, scene: &Scene) -> (Vec<f32>, Gradients) {
-    let (frame, gradients) = scene.frame_and_gradients(&upstream(1, scene));
-    assert_finite(&format!("{what}: image"), &frame.image);
-    gradients.assert_finite(what);
-    (frame.image, gradients)
+/// The scene in the antialiased mode: every row of the table holds there too.
+fn antialiased(scene: &Scene) -> Scene {
+    let mut scene = scene.clone();
+    scene.options.antialiased = true;
+    scene
 }
 
-/// Asserts that the image is the reference's, off fragile pixels.
+/// Renders with random upstream gradients, antialiased and as asked, and asserts that everything is finite.
+#[track_caller]
+fn finite(what: &str, scene: &Scene) -> (Vec<f32>, Gradients) {
+    let mut last = None;
+    for scene in [&antialiased(scene), scene] {
+        let (frame, gradients) = scene.frame_and_gradients(&upstream(1, scene));
+        let what = format!("{what}, antialiased {}", scene.options.antialiased);
+        assert_finite(&format!("{what}: image"), &frame.image);
+        gradients.assert_finite(&what);
+        last = Some((frame.image, gradients));
+    }
+    last.expect("two modes were rendered")
+}
+
+/// Asserts that the image is the reference's, off fragile pixels, antialiased and as asked.
 #[track_caller]
 fn like_reference(what: &str, scene: &Scene, max_abs: f64) {
-    let (frame, reference) = (scene.frame(), scene.reference());
-    let expected = sturdy(&interleaved(&reference, frame.channels), frame.channels, &reference.fragile);
-    let found = sturdy(&frame.image, frame.channels, &reference.fragile);
-    assert_close(what, &found, &expected, Tolerance::max_abs(max_abs));
+    for scene in [&antialiased(scene), scene] {
+        let (frame, reference) = (scene.frame(), scene.reference());
+        let expected = sturdy(&interleaved(&reference, frame.channels), frame.channels, &reference.fragile);
+        let found = sturdy(&frame.image, frame.channels, &reference.fragile);
+        let what = format!("{what}, antialiased {}", scene.options.antialiased);
+        assert_close(&what, &found, &expected, Tolerance::max_abs(max_abs));
+    }
 }
 
 fn is_background(scene: &Scene) -> bool {
@@ -291,7 +306,12 @@ fn without_damaged(scene: &Scene) -> Scene {
 
 #[test]
 fn non_finite_parameters_are_culled_and_change_nothing_else() {
-    let mut scene = random(21, Draw { n: 40, stray: 0.0, ..Draw::default() });
+    let scene = random(21, Draw { n: 40, stray: 0.0, ..Draw::default() });
+    non_finite_parameters(antialiased(&scene));
+    non_finite_parameters(scene);
+}
+
+fn non_finite_parameters(mut scene: Scene) {
     // In the middle of the view, so that only the damaged value can cull it.
     let in_front = scene.camera.camera_from_world.inverse().transform_point3(glam::Vec3::new(0.0, 0.0, 3.0));
     scene.cloud.means[DAMAGED] = in_front.to_array();

@@ -29,10 +29,13 @@ fn dense() -> Vec<Scene> {
         Draw { n: 300, size: [101, 67], log_scale: [-2.5, 0.0], opacity: [0.3, 0.999], ..Draw::default() },
         Draw { n: 400, size: [50, 37], log_scale: [-2.0, 0.2], opacity: [0.05, 0.6], sh_degree: 0, ..Draw::default() },
         Draw { n: 250, size: [33, 64], log_scale: [-3.0, 0.5], opacity: [0.5, 0.999], sh_degree: 3, ..Draw::default() },
+        // Antialiased.
+        Draw { n: 400, size: [64, 41], log_scale: [-3.5, -1.0], opacity: [0.6, 0.999], ..Draw::default() },
     ];
     let scenes = draws.into_iter().enumerate().map(|(seed, draw)| {
         let mut scene = random(900 + seed as u64, draw);
         scene.options.stats = StatsMode::All;
+        scene.options.antialiased = seed == 3;
         scene
     });
     scenes.collect()

@@ -161,11 +161,14 @@ impl Background {
 pub struct ModelSection {
     /// Degree of the spherical harmonics, 0 to 3. Default 3.
     pub sh_degree: u32,
+    /// Train for antialiased rendering: opacities are lowered by what the least width of a splat adds to its area, so that the
+    /// model looks alike at other resolutions and distances (Mip-Splatting, Yu 2024). Recorded in the model. Default false.
+    pub antialiased: bool,
 }
 
 impl Default for ModelSection {
     fn default() -> Self {
-        Self { sh_degree: 3 }
+        Self { sh_degree: 3, antialiased: false }
     }
 }
 
@@ -315,6 +318,7 @@ impl Config {
         RenderOptions {
             near: self.render.near,
             alpha_max: self.render.alpha_max,
+            antialiased: self.model.antialiased,
             background: self.data.background.fixed_rgb(),
             ..RenderOptions::default()
         }

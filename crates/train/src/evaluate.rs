@@ -60,6 +60,14 @@ pub fn evaluate(
     Ok(EvalReport { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), num_gaussians: splats.len(), views })
 }
 
+/// The expected depth of a frame, `[H, W]` in world units, on the host; `None` unless its options asked for depth.
+///
+/// # Errors
+/// As [`rgb`].
+pub fn expected_depth(rendered: &Rendered) -> Result<Option<Vec<f32>>> {
+    rendered.expected_depth().map(read).transpose()
+}
+
 /// The colours of a frame, `[H, W, 3]`, on the host.
 ///
 /// # Errors

@@ -1,5 +1,6 @@
 //! `gazesplat bench ablation`: what scale decay and removal each contribute (RTGS Fig. 10).
 
+use super::super::antialiased::{AntialiasedArgs, carried_to_pruning};
 use super::super::device::ComputeDevice;
 use super::super::prune::curve::{self, Level};
 use super::super::prune::stage::{Stage, with_terms};
@@ -9,7 +10,6 @@ use crate::console::{Console, grouped};
 use crate::diagnostics::{Failure, Result};
 use crate::progress::TrainProgress;
 use crate::run_dir::{create_all, to_json, write_text};
-use crate::settings::PRUNE;
 use clap::Args;
 use gazesplat_core::GaussianCloud;
 use gazesplat_core::io::ply;
@@ -40,6 +40,9 @@ pub struct AblationArgs {
     /// Frames timed per view and model, of which the median counts
     #[arg(long, value_name = "N", default_value_t = 5)]
     pub repeats: usize,
+    /// Antialiasing
+    #[command(flatten)]
+    pub antialiased: AntialiasedArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -80,7 +83,7 @@ fn study(args: &AblationArgs, device: &ComputeDevice, console: &Console) -> Resu
     log_machine();
     let model = Model::load(&args.model, console)?;
     let recorded = model.run_settings()?;
-    let settings = recorded.carried_to(&PRUNE, &["data", "render"]).with_overrides(&args.overrides)?;
+    let settings = args.antialiased.over(carried_to_pruning(&recorded)?.with_overrides(&args.overrides)?)?;
     let (config, terms) = settings.resolve_pruning()?;
     let stage = Stage::new(&model, &args.scene, &config, &recorded, device.tensors(), console)?;
     let without_removal = {

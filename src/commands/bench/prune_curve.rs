@@ -3,6 +3,7 @@
 //! Every criterion ranks the dense model once, by all training views; every share is cut from that ranking, trained on for
 //! the same steps if that is asked for, measured, and timed frame by frame in turn with all others.
 
+use super::super::antialiased::AntialiasedArgs;
 use super::super::device::ComputeDevice;
 use super::super::prune::curve::{self, Level, correlation};
 use super::super::{Model, Split, load_scene, log_machine, quality};
@@ -62,6 +63,9 @@ pub struct CurveArgs {
     /// Settings
     #[command(flatten)]
     pub settings: SettingsArgs,
+    /// Antialiasing
+    #[command(flatten)]
+    pub antialiased: AntialiasedArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -115,7 +119,8 @@ pub fn command(args: &CurveArgs, console: &Console) -> Result<()> {
 fn study(args: &CurveArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
     log_machine();
     let model = Model::load_for_drawing(&args.model, console)?;
-    let config = model.settings(&args.settings)?;
+    let mut config = model.settings(&args.settings)?;
+    config.model.antialiased = args.antialiased.or(config.model.antialiased);
     let dataset = load_scene(&args.scene, &config, console)?;
     let views = args.split.views(&dataset, &args.scene)?;
     let images = ImageCache::new(views.clone(), config.data.cache_bytes);

@@ -9,6 +9,7 @@ mod measure;
 mod output;
 mod stops;
 
+use super::super::antialiased::AntialiasedArgs;
 use super::super::device::ComputeDevice;
 use super::super::termination::{TerminationArgs, constant};
 use super::super::{Model, Split, load_scene, log_machine};
@@ -63,6 +64,9 @@ pub struct StudyArgs {
     /// Settings
     #[command(flatten)]
     pub settings: SettingsArgs,
+    /// Antialiasing
+    #[command(flatten)]
+    pub antialiased: AntialiasedArgs,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -135,7 +139,8 @@ pub fn command(args: &StudyArgs, console: &Console) -> Result<()> {
 fn study(args: &StudyArgs, flip: Flip, device: &ComputeDevice, console: &Console) -> Result<()> {
     log_machine();
     let model = Model::load_for_drawing(&args.model, console)?;
-    let config = model.settings(&args.settings)?;
+    let mut config = model.settings(&args.settings)?;
+    config.model.antialiased = args.antialiased.or(config.model.antialiased);
     let all = args.split.views(&load_scene(&args.scene, &config, console)?, &args.scene)?;
     let num = args.views.unwrap_or(all.len()).min(all.len());
     let views: Vec<View> = (0..num).map(|i| all[i * all.len() / num].clone()).collect();

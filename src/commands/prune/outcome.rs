@@ -10,6 +10,7 @@ use crate::report::study::{TwoAxes, two_axes};
 use crate::report::{Figure, Measured as Views, PictureRow, Report, Section, html};
 use crate::run_dir::RunDir;
 use crate::settings;
+use gazesplat_core::io::model::ANTIALIASED_COMMENT;
 use gazesplat_core::io::ply;
 use gazesplat_core::{GaussianCloud, RgbImage8, View};
 use gazesplat_render::cluster::morton_order;
@@ -157,7 +158,7 @@ impl Run<'_> {
     /// Where the model comes from, for the header of its file: equal runs give equal files.
     fn provenance(&self, result: &ResultLine) -> Vec<String> {
         let Plan { prune, adapt, .. } = *self.pruner.plan();
-        vec![
+        let mut lines = vec![
             format!("Scene: {}, {}", super::scene_name(&self.scene), self.stage.dataset.source),
             format!(
                 "Pruned: {} of {} Gaussians by {}, {} steps, seed {}, at most {} of the quality lost on {} views ({})",
@@ -170,7 +171,9 @@ impl Run<'_> {
                 self.stage.split.guard.len(),
                 self.stage.split.views.name()
             ),
-        ]
+        ];
+        lines.extend(self.config.model.antialiased.then(|| ANTIALIASED_COMMENT.to_owned()));
+        lines
     }
 
     fn sections(&self, result: &ResultLine, curve: Option<String>, panels: Vec<PictureRow>) -> Vec<Section> {

@@ -45,6 +45,7 @@ impl Stage {
             train_config.data.test_every == config.data.test_every && train_config.data.images == config.data.images;
         let trained = (model.run.is_some() && is_same_split).then_some(train_config.data.holdout);
         (train_config.data, train_config.render) = (config.data.clone(), config.render.clone());
+        train_config.model.antialiased = config.model.antialiased;
         // What training kept out is split here, by the same rule.
         train_config.data.holdout = Holdout::None;
         let dataset = load_scene(scene, &train_config, console)?;

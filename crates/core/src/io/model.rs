@@ -102,6 +102,14 @@ impl FromStr for ModelFormat {
     }
 }
 
+/// The comment of a PLY file whose model was trained for antialiased rendering (Mip-Splatting); Brush writes the same. An SPZ
+/// file has a flag for it, which comes as this comment and goes with it; `.splat` has no place for either.
+pub const ANTIALIASED_COMMENT: &str = "SplatRenderMode: mip";
+
+fn is_antialiased(comments: &[String]) -> bool {
+    comments.iter().any(|comment| comment.trim().eq_ignore_ascii_case(ANTIALIASED_COMMENT))
+}
+
 /// What a file held besides the model.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ModelReport {
@@ -113,10 +121,17 @@ pub struct ModelReport {
     pub num_dropped_non_finite: usize,
     /// Rows left out because their quaternion is zero, which is no rotation.
     pub num_dropped_zero_quat: usize,
-    /// Comment lines of a PLY header.
+    /// Comment lines of a PLY header; of an SPZ file [`ANTIALIASED_COMMENT`] where its flag is set.
     pub comments: Vec<String>,
     /// What was passed over, in sentences for people.
     pub notes: Vec<String>,
+}
+
+impl ModelReport {
+    /// Whether the file says that the model was trained for antialiased rendering.
+    pub fn is_antialiased(&self) -> bool {
+        is_antialiased(&self.comments)
+    }
 }
 
 /// Reads the model in the file `path`; its first bytes tell the format, the name only that of `.splat` files, which have
@@ -133,8 +148,10 @@ pub fn load_with_report(path: impl AsRef<Path>) -> Result<(GaussianCloud, ModelR
     let is_ply = bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r\n");
     let (mut comments, mut notes) = (Vec::new(), Vec::new());
     let (cloud, rows, format) = if spz::is_spz(&bytes) {
-        let (cloud, rows, found) = spz::read(path, &bytes)?;
-        notes = found;
+        let content = spz::read(path, &bytes)?;
+        let (cloud, rows) = (content.cloud, content.report);
+        notes = content.notes;
+        comments.extend(content.antialiased.then(|| ANTIALIASED_COMMENT.to_owned()));
         (cloud, rows, ModelFormat::Spz3)
     } else if is_splat && !is_ply {
         let (cloud, rows) = splat::read(path, &bytes)?;
@@ -166,7 +183,8 @@ pub struct SaveOptions {
     pub format: ModelFormat,
     /// Bits per SH coefficient in an SPZ file, 1 to 8; `None` = 5 for degree 1 and 4 for the others.
     pub sh_bits: Option<u32>,
-    /// Comment lines for the header of a PLY file; other formats have no place for them.
+    /// Comment lines for the header of a PLY file; other formats have no place for them, but SPZ for
+    /// [`ANTIALIASED_COMMENT`].
     pub comments: Vec<String>,
 }
 
@@ -191,7 +209,8 @@ pub fn save(path: impl AsRef<Path>, cloud: &GaussianCloud, options: &SaveOptions
     let cut = cut.then(|| cloud.with_sh_degree(options.format.max_sh_degree()));
     let cloud = cut.as_ref().unwrap_or(cloud);
     let spz_options = |version| {
-        let defaults = SpzOptions { version, ..SpzOptions::default() };
+        let antialiased = is_antialiased(&options.comments);
+        let defaults = SpzOptions { version, antialiased, ..SpzOptions::default() };
         options.sh_bits.map_or(defaults, |bits| SpzOptions { sh1_bits: bits, sh_rest_bits: bits, ..defaults })
     };
     let num_clamped = match options.format {

@@ -218,6 +218,23 @@ fn comments_are_one_line_of_ascii_and_come_back() {
     }
 }
 
+/// PLY files say it in a comment, SPZ files by a flag; `.splat` cannot.
+#[test]
+fn antialiased_models_say_so_in_every_format_that_can() {
+    let dir = tempfile::tempdir().unwrap();
+    let cloud = random_cloud(3, 1, 1);
+    for format in ModelFormat::ALL {
+        for comments in [vec!["made by a test".to_owned()], vec![model::ANTIALIASED_COMMENT.to_owned()]] {
+            let asked = comments[0] == model::ANTIALIASED_COMMENT;
+            let path = dir.path().join(name(format));
+            model::save(&path, &cloud, &SaveOptions { format, sh_bits: None, comments }).unwrap();
+            let report = load_with_report(&path).unwrap().1;
+            assert_eq!(report.is_antialiased(), asked && format != ModelFormat::Splat, "{format}");
+            assert!(report.notes.is_empty(), "{format}: {:?}", report.notes);
+        }
+    }
+}
+
 #[test]
 fn real_models_keep_their_values_in_every_format() {
     let Some(path) = gazesplat_testkit::data_path("model_plush/point_cloud.ply") else { return };

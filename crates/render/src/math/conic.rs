@@ -16,6 +16,8 @@ pub struct Dilated {
     pub cov: Sym2,
     /// det Σ', pixels⁴.
     pub det: f32,
+    /// det Σ'_raw = det(M Mᵀ), before the dilation, pixels⁴.
+    pub raw_det: f32,
 }
 
 /// Part of a row of pixels, in pixels: empty when `min > max`.
@@ -44,6 +46,7 @@ pub fn dilate(m: Mat2x3) -> Dilated {
     Dilated {
         cov: Sym2 { xx: xx + DILATION, xy: dot(m.row0, m.row1), yy: yy + DILATION },
         det: raw_det + DILATION * (xx + yy) + DILATION * DILATION,
+        raw_det,
     }
 }
 

@@ -3,6 +3,7 @@
 #[cfg(feature = "gpu")]
 use cubecl::prelude::*;
 
+use super::compensation::compensation_vjp;
 use super::conic::{Dilated, conic, conic_vjp, dilate};
 use super::covariance::{factor, factor_vjp_log_scales};
 use super::ewa::{
@@ -10,7 +11,7 @@ use super::ewa::{
     projection_vjp,
 };
 use super::quat::{Quat, UnitQuat, normalize, rotation, rotation_vjp};
-use super::vec::{Mat2x3, Mat3, Sym2, Vec3, row_times};
+use super::vec::{Mat2x3, Mat3, Sym2, Vec3, combine, row_times};
 
 /// Σ' of a Gaussian with everything on the way to it.
 #[cfg_attr(feature = "gpu", derive(CubeType))]
@@ -81,8 +82,46 @@ pub fn footprint_vjp(
     scales: Vec3,
     v: SplatGradient,
 ) -> GeometryGradient {
-    // Conic → Σ' → M = T N.
-    let v_m = outer_vjp(fp.projected_factor, conic_vjp(fp.conic, v.conic));
+    geometry_vjp(view, fp, in_camera, scales, v, factor_vjp(fp, v.conic))
+}
+
+/// As [`footprint_vjp()`] in the antialiased mode: the opacity of the splat depends on its shape as well. `v_log_opacity` is
+/// the upstream gradient of the logarithm of the compensated opacity.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn antialiased_vjp(
+    view: ViewParams,
+    fp: Footprint,
+    in_camera: Vec3,
+    scales: Vec3,
+    v: SplatGradient,
+    v_log_opacity: f32,
+) -> GeometryGradient {
+    let a = factor_vjp(fp, v.conic);
+    let b = compensation_vjp(fp.projected_factor, fp.dilated, fp.conic, v_log_opacity);
+    let v_m =
+        Mat2x3 { row0: combine(1.0_f32, a.row0, 1.0_f32, b.row0), row1: combine(1.0_f32, a.row1, 1.0_f32, b.row1) };
+    geometry_vjp(view, fp, in_camera, scales, v, v_m)
+}
+
+/// Conic → Σ' → M = T N.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+fn factor_vjp(fp: Footprint, v_conic: Sym2) -> Mat2x3 {
+    outer_vjp(fp.projected_factor, conic_vjp(fp.conic, v_conic))
+}
+
+/// Carries the gradient `v_m` of M = T N and those of mean and depth in `v` to the parameters.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+fn geometry_vjp(
+    view: ViewParams,
+    fp: Footprint,
+    in_camera: Vec3,
+    scales: Vec3,
+    v: SplatGradient,
+    v_m: Mat2x3,
+) -> GeometryGradient {
     // N = R S → quaternion and scales.
     let v_n = project_factor_vjp_n(fp.linearization.t, v_m);
     let log_scales = factor_vjp_log_scales(fp.rotation, scales, v_n);

@@ -19,6 +19,7 @@ macro_rules! copy_on_device {
 use copy_on_device;
 
 pub mod alpha;
+pub mod compensation;
 pub mod conic;
 pub mod covariance;
 pub mod ewa;

@@ -5,8 +5,8 @@ pub mod scenes;
 use burn::tensor::{Device, Tensor, TensorData};
 use gazesplat_core::{Camera, GaussianCloud};
 use gazesplat_render::{
-    ColorMax, MeansProbe, Pass, RenderOptions, RenderStats, Residual, SplatStats, Splats, Termination, TerminationLut,
-    cpu_device, render, render_probed,
+    ColorMax, MeansProbe, Pass, RenderOptions, RenderStats, Rendered, Residual, SplatStats, Splats, Termination,
+    TerminationLut, cpu_device, render, render_probed,
 };
 use gazesplat_testkit::reference;
 use std::cell::RefCell;
@@ -180,6 +180,23 @@ impl Scene {
         self.collect(host(out.image), out.stats, out.splat_stats)
     }
 
+    /// Expected depth on the [`device`] of this test, `[H, W]`.
+    pub fn expected_depth(&self) -> Vec<f32> {
+        let splats = Splats::from_cloud(&self.cloud, &device()).expect("it fits");
+        let out = render(&splats, &self.camera, &self.options).expect("the scene is legal");
+        host(out.expected_depth().expect("the scene asks for depth"))
+    }
+
+    /// Gradients of Σ upstream · expected depth on the [`device`] of this test; `upstream` is `[H, W]`.
+    pub fn expected_depth_gradients(&self, upstream: &[f32]) -> Gradients {
+        self.gradients_of(&device(), |out| {
+            let depth = out.expected_depth().expect("the scene asks for depth");
+            let weights = TensorData::new(upstream.to_vec(), depth.dims());
+            (depth.clone() * Tensor::from_data(weights, &depth.device())).sum()
+        })
+        .1
+    }
+
     /// Renders on the [`device`] of this test and pulls `upstream` (as long as the image) back to the parameters.
     pub fn frame_and_gradients(&self, upstream: &[f32]) -> (Frame, Gradients) {
         self.frame_and_gradients_on(&device(), upstream)
@@ -187,15 +204,21 @@ impl Scene {
 
     /// Renders and pulls `upstream` (as long as the image) back to the parameters.
     pub fn frame_and_gradients_on(&self, device: &Device, upstream: &[f32]) -> (Frame, Gradients) {
+        self.gradients_of(device, |out| {
+            let weights = TensorData::new(upstream.to_vec(), out.image.dims());
+            (out.image.clone() * Tensor::<3>::from_data(weights, &out.image.device())).sum()
+        })
+    }
+
+    /// Renders, and the gradients of `loss` with respect to the parameters.
+    fn gradients_of(&self, device: &Device, loss: impl FnOnce(&Rendered) -> Tensor<1>) -> (Frame, Gradients) {
         let device = device.clone().autodiff();
         let n = self.cloud.len();
         let splats = Splats::from_cloud(&self.cloud, &device).expect("it fits").require_grad();
         let probe = MeansProbe::new(n, &device);
         let options = RenderOptions { pass: training(self.options.pass), ..self.options.clone() };
         let out = render_probed(&splats, &probe, &self.camera, &options).expect("the scene is legal");
-        let [h, w, c] = out.image.dims();
-        let weights = Tensor::<3>::from_data(TensorData::new(upstream.to_vec(), [h, w, c]), &device);
-        let grads = (out.image.clone() * weights).sum().backward();
+        let grads = loss(&out).backward();
         let frame = self.collect(host(out.image), out.stats, out.splat_stats);
         fn values<const D: usize>(gradient: Option<Tensor<D>>, len: usize) -> Vec<f32> {
             gradient.map_or_else(|| vec![0.0; len], host)
@@ -261,6 +284,7 @@ impl Scene {
             table,
             background: self.options.background.map(f64::from),
             sh_degree: self.options.sh_degree.unwrap_or(self.cloud.sh_degree),
+            antialiased: self.options.antialiased,
             ..reference::Options::default()
         }
     }

@@ -28,6 +28,16 @@ pub struct PruneConfig {
     pub data: DataSection,
     /// The renderer; as `data`.
     pub render: RenderSection,
+    /// What the model was trained for; as `data`.
+    pub model: PruneModelSection,
+}
+
+/// What the model was trained for.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PruneModelSection {
+    /// Count, judge and train on in the antialiased mode. Default false, or what the model says.
+    pub antialiased: bool,
 }
 
 /// Schedule and rounds (RTGS Fig. 6).
@@ -259,6 +269,7 @@ impl PruneConfig {
         config.train.seed = self.prune.seed;
         config.train.eval_every = 0;
         config.model.sh_degree = sh_degree;
+        config.model.antialiased = self.model.antialiased;
         config.optim = OptimSection {
             means_lr: self.optim.means_lr,
             means_lr_end: self.optim.means_lr_end,

@@ -51,11 +51,13 @@ pub struct SpzOptions {
     pub sh1_bits: u32,
     /// Bits per SH coefficient of the higher degrees, 1 to 8. Default 4, as the reference implementation has it.
     pub sh_rest_bits: u32,
+    /// The flag of a model that was trained for antialiased rendering. Default false.
+    pub antialiased: bool,
 }
 
 impl Default for SpzOptions {
     fn default() -> Self {
-        Self { version: SpzVersion::V3, sh1_bits: 5, sh_rest_bits: 4 }
+        Self { version: SpzVersion::V3, sh1_bits: 5, sh_rest_bits: 4, antialiased: false }
     }
 }
 
@@ -118,24 +120,33 @@ pub(super) fn is_spz(bytes: &[u8]) -> bool {
     bytes.starts_with(MAGIC) || bytes.starts_with(GZIP)
 }
 
-/// Reads the model in `bytes`, the content of `path`; sentences for people about what was passed over come with it.
-pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<(GaussianCloud, PlyReport, Vec<String>)> {
+/// What a file holds.
+pub(super) struct SpzContent {
+    /// The model.
+    pub cloud: GaussianCloud,
+    /// What was left out of it.
+    pub report: PlyReport,
+    /// What was passed over, in sentences for people.
+    pub notes: Vec<String>,
+    /// Whether the model was trained for antialiased rendering.
+    pub antialiased: bool,
+}
+
+/// Reads the model in `bytes`, the content of `path`.
+pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<SpzContent> {
     let mut notes = Vec::new();
     let (header, streams, axes) = if bytes.starts_with(MAGIC) {
         container::read_zstd(path, bytes, &mut notes)?
     } else {
         container::read_gzip(path, bytes, &mut notes)?
     };
-    if header.flags & FLAG_ANTIALIASED != 0 {
-        notes.push("the model was trained for antialiased rendering".into());
-    }
     let mut cloud = Packed::of_streams(&header, &streams).unpack();
     if let Some(axes) = axes {
         axes::flip(&mut cloud, axes.signs_to(Axes::RDF));
     }
     let unusable = UnusableRow::all_of(&cloud);
     let (cloud, report) = without_unusable(cloud, &unusable);
-    Ok((cloud, report, notes))
+    Ok(SpzContent { cloud, report, notes, antialiased: header.flags & FLAG_ANTIALIASED != 0 })
 }
 
 /// Writes `cloud`; the file appears complete or not at all. Returns how many values lay outside the range of the format
@@ -161,7 +172,8 @@ pub fn save(path: impl AsRef<Path>, cloud: &GaussianCloud, options: SpzOptions) 
         SpzVersion::V3 => (3, [options.sh1_bits, options.sh_rest_bits]),
         SpzVersion::V4 => (4, [options.sh1_bits, options.sh_rest_bits]),
     };
-    let header = Header { version, num_points: cloud.len(), sh_degree: cloud.sh_degree, fractional_bits, flags: 0 };
+    let flags = if options.antialiased { FLAG_ANTIALIASED } else { 0 };
+    let header = Header { version, num_points: cloud.len(), sh_degree: cloud.sh_degree, fractional_bits, flags };
     let (streams, num_clamped) = packed::pack(cloud, fractional_bits, bits);
     super::write_atomically(path.as_ref(), |out| match options.version {
         SpzVersion::V3 => container::write_gzip(out, &header, &streams),

@@ -7,6 +7,7 @@
 use crate::cluster::{Cluster, Frustum};
 use crate::layout::{ALPHA_MIN, CLUSTER, DET_MIN, EXTENT_SLACK, QUAT_NORM2_MIN, lane};
 use crate::math::alpha::{LOG2_E, contour_power2, sigmoid};
+use crate::math::compensation::compensation;
 use crate::math::ewa::{ViewParams, to_camera, view_direction};
 use crate::math::footprint::footprint;
 use crate::math::quat::Quat;
@@ -105,7 +106,7 @@ impl ProjectedSplats<'_> {
     }
 }
 
-/// One view: camera, image size, near plane.
+/// One view: camera, image size, near plane, antialiasing.
 #[derive(Debug, Clone, Copy)]
 pub struct ViewSpec {
     /// Camera.
@@ -116,6 +117,8 @@ pub struct ViewSpec {
     pub height: u32,
     /// Near plane, world units.
     pub near: f32,
+    /// Opacities are compensated for the dilation ([`crate::math::compensation`]).
+    pub antialiased: bool,
 }
 
 /// What became of one Gaussian.
@@ -202,7 +205,7 @@ fn project_one(g: &GaussianSlices<'_>, view: &ViewSpec, frustum: &Frustum, i: us
     if ![mean.x, mean.y, mean.z, logit].iter().chain(rest).all(|v| v.is_finite()) {
         return Outcome::NonFinite;
     }
-    let opacity = sigmoid(logit);
+    let mut opacity = sigmoid(logit);
     if opacity < ALPHA_MIN || quat.iter().all(|q| q.abs() < 0.5 * QUAT_NORM2_MIN.sqrt()) {
         return Outcome::Culled;
     }
@@ -214,6 +217,12 @@ fn project_one(g: &GaussianSlices<'_>, view: &ViewSpec, frustum: &Frustum, i: us
     let fp = footprint(view.params, in_camera, g.quat(i), scales);
     if fp.unit.norm * fp.unit.norm < QUAT_NORM2_MIN || fp.dilated.det <= DET_MIN {
         return Outcome::Culled;
+    }
+    if view.antialiased {
+        opacity *= compensation(fp.dilated);
+        if opacity < ALPHA_MIN {
+            return Outcome::Culled;
+        }
     }
     // 5. Extent of the contour α = 1/255.
     let log2_opacity = opacity.ln() * LOG2_E;

@@ -10,7 +10,7 @@ use super::rasterize_bwd::Record;
 use crate::layout::{CLUSTER, grad_lane, lane};
 use crate::math::alpha::sigmoid;
 use crate::math::ewa::{ViewDirection, to_camera, view_direction, view_direction_vjp};
-use crate::math::footprint::{SplatGradient, footprint, footprint_vjp};
+use crate::math::footprint::{SplatGradient, antialiased_vjp, footprint, footprint_vjp};
 use crate::math::sh;
 use crate::math::vec::{Sym2, Vec3};
 use crate::simd::{prefetch, vectorize};
@@ -160,7 +160,10 @@ fn row_gradient(
         depth: v[lane::DEPTH],
         conic: Sym2 { xx: v[lane::CONIC_XX], xy: v[lane::CONIC_XY], yy: v[lane::CONIC_YY] },
     };
-    let geometry = footprint_vjp(view.params, fp, in_camera, scales, upstream);
+    let geometry = match view.antialiased {
+        false => footprint_vjp(view.params, fp, in_camera, scales, upstream),
+        true => antialiased_vjp(view.params, fp, in_camera, scales, upstream, v[lane::LOG2_OPACITY]),
+    };
     let (v_mean, v_quat, v_log_scales) = (geometry.mean, geometry.quat, geometry.log_scales);
     // Colour: gated where it was clamped at 0.
     let v_color: [f32; 3] = std::array::from_fn(|c| if color[c] > 0.0 { v[lane::RED + c] } else { 0.0 });
@@ -170,7 +173,7 @@ fn row_gradient(
         mean: [v_mean.x + v_through_color.x, v_mean.y + v_through_color.y, v_mean.z + v_through_color.z],
         quat: [v_quat.w, v_quat.x, v_quat.y, v_quat.z],
         log_scales: [v_log_scales.x, v_log_scales.y, v_log_scales.z],
-        // v is ∂L/∂ln o, and ∂ ln o/∂logit = 1 − o = σ(−logit), which keeps its digits where o is close to 1.
+        // v is ∂L/∂ln o, compensated or not, and ∂ ln o/∂logit = 1 − o = σ(−logit), which keeps its digits where o is close to 1.
         opacity_logit: v[lane::LOG2_OPACITY] * sigmoid(-g.opacity_logits[i]),
         color: v_color,
     }

@@ -13,6 +13,7 @@ use crate::gpu::{Gpu, contiguous, cube_dim};
 use crate::kernels::cpu::project::ViewSpec;
 use crate::layout::{ALPHA_MIN, DET_MIN, EXTENT_SLACK, QUAT_NORM2_MIN, lane};
 use crate::math::alpha::{LOG2_E, contour_power2, sigmoid};
+use crate::math::compensation::compensation;
 use crate::math::ewa::{ViewParams, ViewParamsLaunch, to_camera, view_direction};
 use crate::math::footprint::footprint;
 use crate::math::frustum::{Side, SideLaunch, Sides, SidesLaunch, excludes};
@@ -124,6 +125,7 @@ pub fn project(gpu: &Gpu, g: &GaussianBuffers, view: &ViewSpec) -> Result<Projec
             g.len as u32,
             g.num_coefficients as u32,
             g.sh_degree,
+            view.antialiased,
         );
     }
     let visible_offsets = exclusive_scan(gpu, &visible, g.len)?;
@@ -171,6 +173,7 @@ fn project_kernel(
     num_splats: u32,
     num_coefficients: u32,
     #[comptime] sh_degree: u32,
+    #[comptime] antialiased: bool,
 ) {
     let i = ABSOLUTE_POS;
     if i >= num_splats as usize {
@@ -197,7 +200,7 @@ fn project_kernel(
         lanes[row + lane::DEPTH] = NON_FINITE_DEPTH;
         terminate!();
     }
-    let opacity = sigmoid(logit);
+    let mut opacity = sigmoid(logit);
     let largest = f32::max(f32::max(f32::abs(quat.w), f32::abs(quat.x)), f32::max(f32::abs(quat.y), f32::abs(quat.z)));
     if opacity < ALPHA_MIN || largest < 0.5_f32 * f32::sqrt(QUAT_NORM2_MIN) {
         terminate!();
@@ -210,6 +213,12 @@ fn project_kernel(
     let fp = footprint(view, in_camera, quat, scales);
     if fp.unit.norm * fp.unit.norm < QUAT_NORM2_MIN || fp.dilated.det <= DET_MIN {
         terminate!();
+    }
+    if comptime!(antialiased) {
+        opacity *= compensation(fp.dilated);
+        if opacity < ALPHA_MIN {
+            terminate!();
+        }
     }
     // 5. Extent of the contour α = 1/255.
     let log2_opacity = f32::ln(opacity) * LOG2_E;

@@ -14,7 +14,7 @@ use crate::kernels::cpu::project::ViewSpec;
 use crate::layout::{grad_lane, lane};
 use crate::math::alpha::sigmoid;
 use crate::math::ewa::{ViewParams, to_camera, view_direction, view_direction_vjp};
-use crate::math::footprint::{SplatGradient, footprint, footprint_vjp};
+use crate::math::footprint::{SplatGradient, antialiased_vjp, footprint, footprint_vjp};
 use crate::math::sh;
 use crate::math::vec::{Sym2, Vec3};
 use burn::tensor::{DType, Shape};
@@ -81,6 +81,7 @@ pub fn project_bwd(
             g.num_coefficients as u32,
             g.sh_degree,
             probe,
+            view.antialiased,
         );
     }
     let mut handle = whole.handle.clone();
@@ -145,6 +146,7 @@ fn project_bwd_kernel(
     num_coefficients: u32,
     #[comptime] sh_degree: u32,
     #[comptime] probe: bool,
+    #[comptime] antialiased: bool,
 ) {
     let i = ABSOLUTE_POS;
     if i >= num_splats as usize {
@@ -200,7 +202,11 @@ fn project_bwd_kernel(
             yy: v_projected[row + lane::CONIC_YY],
         },
     };
-    let v = footprint_vjp(view, fp, in_camera, scales, upstream);
+    let v = if comptime!(antialiased) {
+        antialiased_vjp(view, fp, in_camera, scales, upstream, v_projected[row + lane::LOG2_OPACITY])
+    } else {
+        footprint_vjp(view, fp, in_camera, scales, upstream)
+    };
     // Colour → SH, and through the viewing direction to the mean.
     let v_color = Vec3 {
         x: v_projected[row + lane::RED],
@@ -211,7 +217,7 @@ fn project_bwd_kernel(
     let v_direction = sh_direction_gradient(sh, i * num_sh, direction.unit, v_color, sh_degree);
     let through_color = view_direction_vjp(direction, v_direction);
     let v_mean = Vec3 { x: v.mean.x + through_color.x, y: v.mean.y + through_color.y, z: v.mean.z + through_color.z };
-    // v is ∂L/∂ln o, and ∂ ln o/∂logit = 1 − o = σ(−logit), which keeps its digits where o is close to 1.
+    // v is ∂L/∂ln o, compensated or not, and ∂ ln o/∂logit = 1 − o = σ(−logit), which keeps its digits where o is close to 1.
     let v_logit = v_projected[row + lane::LOG2_OPACITY] * sigmoid(-opacity_logits[i]);
     let is_row_finite = is_finite(v_mean.x)
         && is_finite(v_mean.y)

@@ -61,7 +61,7 @@ impl Camera {
 mod tests {
     use super::*;
     use crate::camera::Pinhole;
-    use glam::{Mat4, Vec3};
+    use glam::Vec3;
 
     /// The series of the matrix exponential, its own definition.
     fn series(twist: Twist) -> DMat4 {
@@ -91,8 +91,8 @@ mod tests {
 
     #[test]
     fn zero_motion_keeps_every_bit() {
-        let pose = Mat4::look_at_rh(Vec3::new(1.3, -0.2, 7.1), Vec3::new(0.1, 0.2, 0.3), Vec3::Y);
-        let camera = Camera { intrinsics: Pinhole::from_fov_x(8, 6, 1.0), camera_from_world: pose };
+        let pinhole = Pinhole::from_fov_x(8, 6, 1.0);
+        let camera = Camera::look_at(pinhole, Vec3::new(1.3, -0.2, 7.1), Vec3::new(0.1, 0.2, 0.3), Vec3::Y);
         assert_eq!(camera.moved([0.0; 6]), camera);
         // A camera that goes up by one sees the world one lower: +y is down.
         let moved = camera.moved([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]);

@@ -79,19 +79,19 @@ pub fn pose_bwd(
 #[cube]
 fn sum_units(shared: &mut Shared<[f32]>) {
     let unit = UNIT_POS as usize;
-    let mut distance = UNITS as usize / 2;
-    while distance > 0 {
-        sync_cube();
-        if unit < distance {
+    sync_cube();
+    let mut distance = 1usize;
+    while distance < UNITS as usize {
+        if unit & (2 * distance - 1) == 0 {
             #[unroll]
             for l in 0..6usize {
                 let other = shared[(unit + distance) * 6 + l];
                 shared[unit * 6 + l] += other;
             }
         }
-        distance /= 2;
+        sync_cube();
+        distance *= 2;
     }
-    sync_cube();
 }
 
 #[cube(launch)]

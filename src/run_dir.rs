@@ -7,6 +7,7 @@
 //! | `point_cloud.ply` | the model, 3DGS layout |
 //! | `eval.json` | test-view quality |
 //! | `report.html` | all of it to look at |
+//! | `poses.json` | only of a run with `train.refine_poses`: where its training views turned out to be |
 //! | `checkpoint-STEP.safetensors` | only of a run that is under way or was interrupted: what `--resume` goes on from |
 //! | `unfinished.ply` | only of a training that failed, or is under way on a GPU: its last good model |
 
@@ -124,6 +125,11 @@ impl RunDir {
         self.path.join("unfinished.ply")
     }
 
+    /// `poses.json`.
+    pub fn poses_path(&self) -> PathBuf {
+        self.path.join("poses.json")
+    }
+
     /// `report.html`.
     pub fn report_path(&self) -> PathBuf {
         self.path.join("report.html")
@@ -137,7 +143,11 @@ impl RunDir {
         let unfinished = self.unfinished_path();
         let files = [self.model_path(), self.eval_path(), self.report_path(), self.metrics_path(), unfinished];
         let checkpoints = checkpoints(&self.path).into_iter().map(|(_, path)| path);
-        files.into_iter().chain([self.settings_path()]).chain(checkpoints).try_for_each(|file| remove(&file))
+        files
+            .into_iter()
+            .chain([self.settings_path(), self.poses_path()])
+            .chain(checkpoints)
+            .try_for_each(|file| remove(&file))
     }
 
     /// Writes `settings.toml`: the resolved settings as TOML under lines that say where they come from, and on which device the
@@ -187,6 +197,14 @@ impl RunDir {
     /// When it cannot be removed.
     pub(crate) fn remove_unfinished(&self) -> Result<()> {
         remove(&self.unfinished_path())
+    }
+
+    /// Writes `poses.json`.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write_poses(&self, views: &[gazesplat_core::View]) -> Result<()> {
+        Ok(gazesplat_core::io::poses::save(self.poses_path(), views)?)
     }
 
     /// Writes `eval.json`.

@@ -22,6 +22,7 @@ mod frames;
 mod keeper;
 mod quality;
 mod record;
+mod refined;
 
 use crate::cli::SettingsArgs;
 use crate::console::{Console, grouped};
@@ -83,7 +84,11 @@ pub fn load_scene(scene: &Path, config: &Config, console: &Console) -> Result<Da
         test_every: config.data.test_every,
         holdout: config.data.holdout,
     };
-    let dataset = Dataset::load(scene, &options)?;
+    let mut dataset = Dataset::load(scene, &options)?;
+    if let Some(file) = &config.data.poses {
+        let num_applied = gazesplat_core::io::poses::apply(&mut dataset, file)?;
+        console.note(format_args!("{num_applied} of {} camera poses are those of `{file}`", dataset.all_views().len()));
+    }
     for warning in &dataset.warnings {
         console.warn(warning);
     }

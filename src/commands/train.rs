@@ -6,6 +6,7 @@ use super::checkpoints::{Checkpoints, Resumed};
 use super::device::ComputeDevice;
 use super::keeper::{Keeper, Kept};
 use super::record::Recorder;
+use super::refined::Refined;
 use super::{Model, antialiased, layered, load_scene, log_machine, quality, scene_name};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, duration, grouped};
@@ -247,6 +248,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     let num_steps = trainer.step_index();
     // A lost GPU takes the model with it; what a person waited for is then the last copy.
     let latest = job.device.guard(|| Ok(trainer.to_cloud()?));
+    let refined = job.device.guard(|| Ok(trainer.refined_views()?));
     // Giving back what is on a lost GPU may panic, too; there is nothing to lose by it.
     let _ = job.device.guard(|| {
         drop(trainer);
@@ -264,6 +266,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         (Err(failure), _) | (Ok(_), Err(failure)) => return Err(salvage(failure, &run_dir, kept)),
     };
     run_dir.write_model_with(&cloud, &provenance(job, &dataset, num_steps))?;
+    let refined = Refined::keep(refined?, &run_dir, console)?;
     run_dir.remove_unfinished()?;
     if outcome == Outcome::Stopped {
         console.note(format_args!("stopped after {num_steps} of {} steps, saving what there is", config.train.steps));
@@ -273,6 +276,12 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     }
 
     let started = Instant::now();
+    let measured_images = match &refined {
+        Some(refined) if measured == Measured::Training => {
+            Arc::new(ImageCache::new(refined.views.clone(), config.data.cache_bytes))
+        }
+        _ => measured_images,
+    };
     let options = config.render_options();
     // The run may just have measured this very model.
     let known = recorder.take_evaluation(num_steps).filter(|eval| eval.num_gaussians == cloud.len());
@@ -312,7 +321,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         scores: eval.views.iter().map(|v| (v.name.clone(), v.psnr, v.ssim)).collect(),
         sections: Vec::new(),
         film: Vec::new(),
-        facts: facts(job, &dataset, &run_dir, cache.as_deref()),
+        facts: facts(job, &dataset, &run_dir, cache.as_deref(), refined.as_ref()),
         durations,
         warnings,
         settings: all_settings,
@@ -396,6 +405,7 @@ fn facts(
     dataset: &Dataset,
     run_dir: &RunDir,
     cache: Option<&ReferenceCache>,
+    refined: Option<&Refined>,
 ) -> Vec<(String, String)> {
     let mut facts = vec![
         ("scene".to_owned(), job.scene.display().to_string()),
@@ -412,6 +422,9 @@ fn facts(
     facts.push(("extent of the cameras".to_owned(), format!("{:.3} world units", dataset.scene_extent())));
     if let Ok(file) = std::fs::metadata(run_dir.model_path()) {
         facts.push(("model file".to_owned(), format!("point_cloud.ply, {}", bytes(file.len()))));
+    }
+    if let Some(refined) = refined {
+        facts.push(("camera poses".to_owned(), refined.described.clone()));
     }
     facts.push(("computed on".to_owned(), job.device.describe()));
     if let Some(model) = &job.init {

@@ -82,6 +82,21 @@ fn killed_training_is_gone_on_with_to_the_same_bytes() {
     assert_same_end(&place, "killed", "whole");
 }
 
+/// The poses are of the state that a checkpoint holds.
+#[test]
+fn killed_refinement_of_poses_ends_in_the_same_bytes() {
+    let place = Place::with_scene();
+    let refine = ["--set", "train.refine_poses=true", "--set", "poses.start=0"];
+    let run = |out: &'static str, more: &[&'static str]| [&args(&["--out", out]), refine.as_slice(), more].concat();
+    place.run(&run("whole", &[])).done();
+    place.kill_when(&run("killed", &[]), || checkpoints(&place, "killed").len() == 2);
+    let said = train(&place, &["--out", "killed", "--resume"]).refused();
+    assert!(said.contains("train.refine_poses = true, now false"), "{said}");
+    place.run(&run("killed", &["--resume"])).done();
+    assert_same_end(&place, "killed", "whole");
+    assert_eq!(place.read("killed/poses.json"), place.read("whole/poses.json"));
+}
+
 #[cfg(unix)]
 #[test]
 fn stopped_training_is_gone_on_with_to_the_same_bytes() {

@@ -15,6 +15,52 @@ fn run_directory_holds_the_five_files() {
 }
 
 #[test]
+fn refined_poses_are_kept_and_a_scene_can_be_seen_by_them() {
+    let place = Place::with_scene();
+    let refine = ["--set", "train.refine_poses=true", "--set", "poses.start=0", "--set", "poses.lr=0.001"];
+    let said = train(&place, &[&["--out", "run"], refine.as_slice()].concat()).done().stderr;
+    assert!(said.contains("camera poses: turned by 0.") && said.contains("poses.json"), "{said}");
+    assert!(place.read("run/report.html").contains("<th>camera poses</th><td>turned by"));
+    let poses: Value = serde_json::from_str(&place.read("run/poses.json")).expect("JSON");
+    let poses = poses["poses"].as_object().expect("an object");
+    // The seven training views of nine; each is a rigid transform by rows.
+    assert_eq!(poses.len(), 7);
+    assert!(poses.values().all(|pose| pose[3] == serde_json::json!([0.0, 0.0, 0.0, 1.0])), "{poses:?}");
+    // Test views keep their poses, so that measuring them again gives the same figures, with the file and without.
+    let eval = |more: &[&str]| {
+        let ended = place.run(&[&["eval", "run", "--scene", "scene"], more].concat()).done();
+        (serde_json::from_str::<Value>(&ended.stdout).expect("JSON"), ended.stderr)
+    };
+    let (plain, _) = eval(&[]);
+    let (with, said) = eval(&["--set", "data.poses=run/poses.json"]);
+    assert!(said.contains("7 of 9 camera poses are those of `run/poses.json`"), "{said}");
+    assert_eq!(plain["psnr"], with["psnr"]);
+    let training = |more: &[&str]| eval(&[&["--split", "train"], more].concat()).0["psnr"].clone();
+    assert_ne!(training(&[]), training(&["--set", "data.poses=run/poses.json"]));
+    // A run begins there, too, and says of no file what is wrong with it.
+    train(&place, &["--out", "again", "--set", "data.poses=run/poses.json"]).done();
+    let said = train(&place, &["--out", "no", "--set", "data.poses=run/eval.json"]).refused();
+    assert!(said.contains("`run/eval.json`: no poses file"), "{said}");
+    let said = train(&place, &["--out", "no", "--set", "data.poses=none.json"]).refused();
+    assert!(said.contains("cannot read `none.json`"), "{said}");
+    let said = train(&place, &["--out", "no", "--set", "poses.lr=0"]).refused();
+    assert!(said.contains("poses.lr: found 0, expected a number above 0 and at most 1"), "{said}");
+}
+
+#[test]
+fn without_test_views_refined_poses_are_what_the_model_is_measured_by() {
+    let place = Place::with_scene();
+    let all = ["--set", "data.test_every=0", "--set", "train.refine_poses=true", "--set", "poses.start=0"];
+    train(&place, &[&["--out", "run"], all.as_slice()].concat()).done();
+    let measured: Value = serde_json::from_str(&place.read("run/eval.json")).expect("JSON");
+    let again = ["eval", "run", "--scene", "scene", "--split", "train", "--set", "data.poses=run/poses.json"];
+    let again: Value = serde_json::from_str(&place.run(&again).done().stdout).expect("JSON");
+    let psnr = |report: &Value| report["psnr"].as_f64().expect("a number");
+    // Rows in another order are composited with another rounding.
+    assert!((psnr(&measured) - psnr(&again)).abs() < 1e-3, "{measured} {again}");
+}
+
+#[test]
 fn metrics_are_one_object_per_logged_step() {
     let place = Place::with_run();
     let lines: Vec<Value> =

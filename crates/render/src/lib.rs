@@ -35,7 +35,7 @@ pub use device::flex_device;
 pub use device::{DeviceChoice, cpu_device, is_gpu};
 pub use error::{Error, Result};
 pub use options::{Pass, RenderOptions, StatsMode};
-pub use renderer::{Counted, MeansProbe, Rendered, count, render, render_probed};
+pub use renderer::{Counted, MeansProbe, PoseProbe, Probes, Rendered, count, render, render_probed, render_with};
 pub use splats::Splats;
 pub use stats::{RenderStats, SplatStats, TileStats};
 pub use termination::{ColorMax, Residual, Termination, TerminationLut};

@@ -41,14 +41,42 @@ impl MeansProbe {
     }
 }
 
+/// A leaf that receives the gradient of the camera's pose: of a motion of the camera on top of the pose it has, as a twist
+/// from the left, camera_from_world' = exp(ω, v) · camera_from_world. A step along it is taken with
+/// [`Camera::moved`](gazesplat_core::Camera::moved); the next frame then takes a fresh probe.
+#[derive(Debug, Clone)]
+pub struct PoseProbe(Tensor<1>);
+
+impl PoseProbe {
+    /// A probe on the autodiff device of the splats.
+    pub fn new(device: &Device) -> Self {
+        Self(Tensor::zeros([6], device).require_grad())
+    }
+
+    /// After `backward`: `[6]` = ∂L/∂(ω, v), per radian about and per world unit along the axes of the camera (OpenCV: +x
+    /// right, +y down, +z forward). `None` if no gradient arrived.
+    pub fn gradient(&self, gradients: &burn::tensor::Gradients) -> Option<Tensor<1>> {
+        self.0.grad(gradients)
+    }
+}
+
+/// Leaves that receive gradients beside those of the splats. What is not asked for costs nothing.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Probes<'a> {
+    /// Of the projected means.
+    pub means: Option<&'a MeansProbe>,
+    /// Of the pose. The sum over the splats is off by rounding of its parts only on the CPU, and by ⌈log₂ V⌉ more roundings
+    /// of the sum of their magnitudes for V visible splats on a GPU; its order is fixed on both.
+    pub pose: Option<&'a PoseProbe>,
+}
+
 /// Draws `splats` as `camera` sees them. Differentiable with respect to everything in `splats` that is tracked.
 ///
 /// # Errors
 /// [`Error::Parameter`] for options or a camera out of range, [`Error::Shape`] if the tensors do not fit together,
 /// [`Error::Limit`] if the frame needs more pairs than there are indices.
 pub fn render(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Rendered> {
-    let probe = Tensor::zeros([0, 4], &splats.device());
-    render_with(splats, probe, camera, options)
+    render_with(splats, Probes::default(), camera, options)
 }
 
 /// [`render`], with the image-plane gradient of the means delivered to `probe`.
@@ -61,7 +89,26 @@ pub fn render_probed(
     camera: &Camera,
     options: &RenderOptions,
 ) -> Result<Rendered> {
-    render_with(splats, probe.0.clone(), camera, options)
+    render_with(splats, Probes { means: Some(probe), ..Probes::default() }, camera, options)
+}
+
+/// [`render`], with further gradients delivered to `probes`.
+///
+/// # Errors
+/// As [`render`].
+pub fn render_with(splats: &Splats, probes: Probes<'_>, camera: &Camera, options: &RenderOptions) -> Result<Rendered> {
+    let frame = frame(splats, camera, options)?;
+    let out = <Dispatch as RenderOps>::render_forward(parameters(splats), probe(splats, probes), frame);
+    let (stats, splat_stats) = out.outcome?;
+    Ok(Rendered { image: Tensor::from_dispatch(out.image), stats, splat_stats })
+}
+
+/// The leaves, empty where nobody asks.
+fn probe(splats: &Splats, probes: Probes<'_>) -> Probe<Dispatch> {
+    let device = splats.device();
+    let means2d = probes.means.map_or_else(|| Tensor::zeros([0, 4], &device), |probe| probe.0.clone());
+    let pose = probes.pose.map_or_else(|| Tensor::zeros([0], &device), |probe| probe.0.clone());
+    Probe { means2d: means2d.into_dispatch(), pose: pose.into_dispatch() }
 }
 
 /// What a frame does and is worth, without the frame.
@@ -92,7 +139,7 @@ pub fn count(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Resul
     if frame.raster.lut.is_none() {
         frame.sh_degree = 0;
     }
-    let probe = Probe { means2d: Tensor::<2>::zeros([0, 4], &splats.device()).into_dispatch() };
+    let probe = probe(splats, Probes::default());
     let out = <Dispatch as RenderOps>::render_forward(parameters(splats), probe, frame);
     let (stats, splat_stats) = out.outcome?;
     Ok(Counted { stats, splat_stats })
@@ -106,14 +153,6 @@ fn parameters(splats: &Splats) -> Parameters<Dispatch> {
         opacity_logits: splats.opacity_logits.clone().into_dispatch(),
         sh: splats.sh.clone().into_dispatch(),
     }
-}
-
-fn render_with(splats: &Splats, probe: Tensor<2>, camera: &Camera, options: &RenderOptions) -> Result<Rendered> {
-    let frame = frame(splats, camera, options)?;
-    let parameters = parameters(splats);
-    let out = <Dispatch as RenderOps>::render_forward(parameters, Probe { means2d: probe.into_dispatch() }, frame);
-    let (stats, splat_stats) = out.outcome?;
-    Ok(Rendered { image: Tensor::from_dispatch(out.image), stats, splat_stats })
 }
 
 /// Checks everything that can be wrong before any work, and puts it into the form the kernels read.

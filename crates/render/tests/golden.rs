@@ -158,7 +158,7 @@ fn check_gradients(table: &mut Table, golden: &Golden, scene: &Scene, device: &D
             gradients.means2d.chunks_exact(4).flat_map(|g| [g[first], g[first + 1]]).collect()
         };
         let (means2d, means2d_abs) = (lanes(0), lanes(2));
-        let groups: [(&str, &str, &[f32]); 7] = [
+        let groups: [(&str, &str, &[f32]); 8] = [
             ("means", "means", &gradients.means),
             ("quats", "quats", &gradients.quats),
             ("log_scales", "log_scales", &gradients.log_scales),
@@ -167,6 +167,8 @@ fn check_gradients(table: &mut Table, golden: &Golden, scene: &Scene, device: &D
             ("means2d", "means2d", &means2d),
             // No yardstick of its own: a sum without cancellation is no harder than the signed one.
             ("means2d_abs", "means2d", &means2d_abs),
+            // Six combinations of the entries of the raw derivative, without a yardstick of their own.
+            ("se3_left", "viewmat", &gradients.pose),
         ];
         for (name, yardstick, found) in groups {
             let array = format!("grad_{loss}.{name}");

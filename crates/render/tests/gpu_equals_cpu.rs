@@ -132,7 +132,7 @@ fn one_adapter_gives_the_same_bits_twice() {
 }
 
 /// Files whose test bodies all run on both processors.
-const ON_BOTH: [(&str, &str); 11] = [
+const ON_BOTH: [(&str, &str); 12] = [
     ("antialiased", include_str!("antialiased.rs")),
     ("counters", include_str!("counters.rs")),
     ("depth", include_str!("depth.rs")),
@@ -140,6 +140,7 @@ const ON_BOTH: [(&str, &str); 11] = [
     ("finite_diff", include_str!("finite_diff.rs")),
     ("golden", include_str!("golden.rs")),
     ("golden_work_stats", include_str!("golden_work_stats.rs")),
+    ("pose", include_str!("pose.rs")),
     ("random_values", include_str!("random_values.rs")),
     ("stability", include_str!("stability.rs")),
     ("stability_limits", include_str!("stability_limits.rs")),
@@ -154,6 +155,9 @@ fn every_body_is_listed_for_the_gpu() {
         // Threads and clusters are the CPU's; the GPU has its own test of equal bits above.
         "image_gradients_and_counters_are_the_same_bits_on_any_number_of_threads",
         "skipping_whole_clusters_does_not_change_the_image",
+        "pose_gradients_are_the_same_bits_on_any_number_of_threads",
+        // It takes both.
+        "pose_gradients_of_the_gpu_are_those_of_the_cpu",
     ];
     for (file, text) in ON_BOTH {
         let (bodies, listed) =

@@ -11,6 +11,7 @@ mod golden;
 mod golden_work_stats;
 mod gpu_equals_cpu;
 mod lost_device;
+mod pose;
 mod random_values;
 mod stability;
 mod stability_limits;

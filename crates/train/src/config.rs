@@ -26,6 +26,8 @@ pub struct Config {
     pub densify: DensifySection,
     /// Terms of the loss.
     pub loss: LossSection,
+    /// Refinement of the camera poses, where `train.refine_poses` asks for it.
+    pub poses: PosesSection,
     /// The renderer.
     pub render: RenderSection,
 }
@@ -50,6 +52,9 @@ pub struct TrainSection {
     /// So many of the latest checkpoints stay while the run is under way; a run that finishes removes them. At least 1.
     /// Default 1.
     pub checkpoint_keep: u32,
+    /// Corrects the poses of the training views along with the model, and writes them to `poses.json`. For captures whose
+    /// poses are not exact: test views keep the ones they are given. Default false.
+    pub refine_poses: bool,
 }
 
 impl Default for TrainSection {
@@ -62,6 +67,7 @@ impl Default for TrainSection {
             eval_every: 5000,
             checkpoint_every: 5000,
             checkpoint_keep: 1,
+            refine_poses: false,
         }
     }
 }
@@ -90,6 +96,8 @@ pub struct DataSection {
     pub max_side: u32,
     /// Image directory beside `sparse`, as in `images_4`; unset = `images`.
     pub images: Option<String>,
+    /// A `poses.json` of an earlier run: the views it names are seen by its poses instead of those of the scene; unset = none.
+    pub poses: Option<String>,
     /// Every n-th view in name order, from the first, is a test view; 0 = all views train. Default 8 (3DGS).
     pub test_every: u32,
     /// Training views kept out of gradient steps, for a guard that judges the model later: `"none"`, or `"every8"`, those
@@ -107,6 +115,7 @@ impl Default for DataSection {
         Self {
             max_side: 1600,
             images: None,
+            poses: None,
             test_every: 8,
             holdout: Holdout::None,
             cache_bytes: 4 << 30,
@@ -295,6 +304,28 @@ impl Default for LossSection {
     }
 }
 
+/// Refinement of the camera poses: Adam (β 0.9 and 0.999, ε 1e-15) on one rigid correction per training view.
+///
+/// The defaults lie between gsplat's (1e-5, `pose_opt_lr`) and what photographs need whose poses are off by some pixels: a view
+/// comes a few hundred times in a run, and moves by at most the sum of the rates then.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PosesSection {
+    /// Rate when poses begin to move: radians, and for the translation scene extents. Default 1e-4 (nerfstudio).
+    pub lr: f32,
+    /// Rate at the last step, reached log-linearly. Default 1e-6.
+    pub lr_end: f32,
+    /// First step at which poses move, in a run of 30,000 steps; scaled with `train.steps`. Before that the model is too coarse
+    /// to tell where a camera is. Default 1000.
+    pub start: u32,
+}
+
+impl Default for PosesSection {
+    fn default() -> Self {
+        Self { lr: 1e-4, lr_end: 1e-6, start: 1000 }
+    }
+}
+
 /// The renderer.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -365,6 +396,10 @@ impl Config {
         non_negative("densify.noise", self.densify.noise)?;
         non_negative("densify.opacity_regularizer", self.densify.opacity_regularizer)?;
         non_negative("densify.scale_regularizer", self.densify.scale_regularizer)?;
+        for (key, rate) in [("poses.lr", self.poses.lr), ("poses.lr_end", self.poses.lr_end)] {
+            // A turn by a radian per step is no refinement.
+            check(rate > 0.0 && rate <= 1.0, key, &rate, "a number above 0 and at most 1")?;
+        }
         let ssim_weight = self.loss.ssim_weight;
         check((0.0..=1.0).contains(&ssim_weight), "loss.ssim_weight", &ssim_weight, "a number in 0..1")?;
         self.render_options().validate().map_err(|error| match error {

@@ -23,6 +23,7 @@ pub mod losses;
 pub mod math;
 pub mod metrics;
 pub mod optim;
+pub mod poses;
 pub mod prune;
 pub mod rng;
 pub mod run;

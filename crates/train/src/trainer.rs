@@ -26,11 +26,15 @@ use burn::tensor::{Device, Gradients, Tensor};
 use gazesplat_core::dataset::Dataset;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Camera, GaussianCloud, sh};
-use gazesplat_render::{Pass, RenderOptions, Rendered, Splats, StatsMode, is_gpu, render};
+use gazesplat_render::{Pass, Probes, RenderOptions, Rendered, Splats, StatsMode, is_gpu, render_with};
 use std::sync::Arc;
-use std::time::Instant;
 
+mod clock;
+mod poses;
 mod resume;
+
+use clock::Clock;
+use poses::Poses;
 
 /// γ of scale decay (RTGS Eq. 4).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,6 +58,8 @@ pub struct Trainer {
     sorted_at: u32,
     losses: WeightedLosses,
     scale_decay: Option<ScaleDecay>,
+    /// Corrections of the poses, if they are refined.
+    poses: Option<Poses>,
     center: [f32; 3],
     extent: f32,
     step: u32,
@@ -112,7 +118,7 @@ impl Trainer {
             StrategyKind::None => Box::new(Fixed),
         };
         let losses = WeightedLosses::default().with(1.0, Box::new(L1Ssim { ssim_weight: config.loss.ssim_weight }));
-        Self {
+        let mut trainer = Self {
             test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
             config: config.clone(),
             images,
@@ -122,12 +128,15 @@ impl Trainer {
             sorted_at: 0,
             losses,
             scale_decay: None,
+            poses: None,
             center,
             extent,
             step: 0,
             view_order: None,
             messages: Vec::new(),
-        }
+        };
+        trainer.poses = Poses::of(&trainer);
+        trainer
     }
 
     /// Adds `weight` times `loss` to what every step minimises.
@@ -175,6 +184,7 @@ impl Trainer {
             sorted_at: 0,
             losses: std::mem::take(&mut self.losses),
             scale_decay: None,
+            poses: None,
             center: self.center,
             extent: self.extent,
             step: 0,
@@ -274,13 +284,17 @@ impl Trainer {
         let stats = if self.scale_decay.is_some() { StatsMode::Tiles } else { StatsMode::None };
         let options = RenderOptions { background, pass: Pass::Train, stats, ..self.config.render_options() };
         let leaves = tracked(&self.state.lent());
-        let Rendered { image, splat_stats, .. } = render(&leaves, &self.images.views()[view].camera, &options)?;
+        let (camera, pose) = self.camera_of(view)?;
+        let probes = Probes { pose: pose.as_ref(), ..Probes::default() };
+        let Rendered { image, splat_stats, .. } = render_with(&leaves, probes, &camera, &options)?;
         stage_ms.forward = clock.lap();
 
         let pending = self.losses.evaluate(image, &target).expect("a trainer has a loss");
         stage_ms.loss = clock.lap();
 
-        let mut gradients = taken(leaves, pending.loss.backward());
+        let gradients = pending.loss.backward();
+        self.note_pose(view, pose, &gradients);
+        let mut gradients = taken(leaves, gradients);
         if let Some(ScaleDecay { weight, scale_unit }) = self.scale_decay {
             let log_scales = self.state.lent().log_scales;
             let used = &splat_stats.tiles_used;
@@ -305,6 +319,7 @@ impl Trainer {
             None
         };
         drop(pending);
+        self.ease_poses()?;
         stage_ms.optim = clock.lap();
 
         let context = StepContext { step: self.step, seed: self.config.train.seed, means_lr: rates.means };
@@ -337,6 +352,7 @@ impl Trainer {
         // The model may have gone back to an earlier state: its updates are then fewer than the steps.
         let step = self.step + number - self.state.num_updates();
         self.step = step - 1;
+        self.forget_poses_from(step - 1);
         self.state.reopen(number - 1);
         let view = self.view_at(step - 1);
         let suspect = Columns::from_splats(self.state.lent())?.most_suspect();
@@ -439,30 +455,6 @@ const SORT_INTERVAL: u32 = 200;
 /// Half the cube a GPU sorts in, in scene extents: its cells are then a hundredth of an extent wide, about a tile's
 /// reach, and what is farther is rarely near anything in the image.
 const SORT_EXTENTS: f32 = 4.0;
-
-/// Milliseconds since the last lap and since the start.
-struct Clock {
-    start: Instant,
-    last: Instant,
-}
-
-impl Clock {
-    fn start() -> Self {
-        let now = Instant::now();
-        Self { start: now, last: now }
-    }
-
-    fn lap(&mut self) -> f32 {
-        let now = Instant::now();
-        let ms = (now - self.last).as_secs_f32() * 1e3;
-        self.last = now;
-        ms
-    }
-
-    fn total(&self) -> f32 {
-        self.start.elapsed().as_secs_f32() * 1e3
-    }
-}
 
 #[cfg(test)]
 mod tests {

@@ -5,6 +5,7 @@ use serde::{Deserialize, Serialize};
 
 pub mod distortion;
 pub mod path;
+pub mod se3;
 
 /// Pinhole intrinsics in pixels of an image of `width` × `height`.
 ///

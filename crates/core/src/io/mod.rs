@@ -14,6 +14,7 @@ mod jpeg;
 mod locate;
 pub mod model;
 pub mod ply;
+pub mod poses;
 mod quantize;
 pub mod splat;
 pub mod spz;

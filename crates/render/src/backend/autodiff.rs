@@ -1,6 +1,6 @@
 //! The hand-written backward pass, hooked into Burn's autodiff.
 
-use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved, host::shape_of};
+use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved, Wanted, host::shape_of};
 use crate::error::Error;
 use burn::backend::{
     Autodiff, AutodiffBackend,
@@ -18,20 +18,20 @@ struct State<B: RenderOps> {
     parameters: Parameters<B>,
     saved: Saved<B>,
     frame: Frame,
-    with_probe: bool,
+    wanted: Wanted,
 }
 
 #[derive(Debug)]
 struct RenderBackward;
 
-impl<B: RenderOps> ops::Backward<B, 6> for RenderBackward {
+impl<B: RenderOps> ops::Backward<B, 7> for RenderBackward {
     type State = State<B>;
 
-    fn backward(self, ops: Ops<Self::State, 6>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
+    fn backward(self, ops: Ops<Self::State, 7>, grads: &mut Gradients, _checkpointer: &mut Checkpointer) {
         let v_image = grads.consume::<B>(&ops.node);
-        let State { parameters, saved, frame, with_probe } = ops.state;
-        let Backward { parameters: v, probe } = B::render_backward(parameters, saved, v_image, frame, with_probe);
-        let values = [v.means, v.quats, v.log_scales, v.opacity_logits, v.sh, probe.means2d];
+        let State { parameters, saved, frame, wanted } = ops.state;
+        let Backward { parameters: v, probe } = B::render_backward(parameters, saved, v_image, frame, wanted);
+        let values = [v.means, v.quats, v.log_scales, v.opacity_logits, v.sh, probe.means2d, probe.pose];
         for (parent, value) in ops.parents.into_iter().zip(values) {
             if let Some(node) = parent {
                 grads.register::<B>(node.id, value);
@@ -84,11 +84,13 @@ impl<B: RenderOps, C: CheckpointStrategy> RenderOps for Autodiff<B, C> {
             parameters.opacity_logits.node(),
             parameters.sh.node(),
             probe.means2d.node(),
+            probe.pose.node(),
         ];
         let prepared = RenderBackward.prepare::<C>(nodes).compute_bound().stateful();
         let parameters = primitives::<B, C>(parameters);
-        let inner_probe = Probe { means2d: probe.means2d.into_primitive() };
-        let with_probe = shape_of::<B>(&inner_probe.means2d)[0] > 0;
+        let inner_probe = Probe { means2d: probe.means2d.into_primitive(), pose: probe.pose.into_primitive() };
+        let asks = |leaf: &FloatTensor<B>| shape_of::<B>(leaf)[0] > 0;
+        let wanted = Wanted { means2d: asks(&inner_probe.means2d), pose: asks(&inner_probe.pose) };
         match prepared {
             OpsKind::Tracked(prepared) => {
                 let has_table = frame.raster.lut.is_some();
@@ -96,7 +98,7 @@ impl<B: RenderOps, C: CheckpointStrategy> RenderOps for Autodiff<B, C> {
                 let out = B::render_forward(parameters.clone(), inner_probe, frame.clone());
                 let outcome = if has_table { Err(no_gradient_through_a_table()) } else { out.outcome };
                 let saved = constants::<B, C>(out.saved.clone());
-                let state = State { parameters, saved: out.saved, frame, with_probe };
+                let state = State { parameters, saved: out.saved, frame, wanted };
                 Forward { image: prepared.finish(state, out.image), saved, outcome }
             }
             OpsKind::UnTracked(prepared) => {
@@ -107,7 +109,13 @@ impl<B: RenderOps, C: CheckpointStrategy> RenderOps for Autodiff<B, C> {
         }
     }
 
-    fn render_backward(_: Parameters<Self>, _: Saved<Self>, _: FloatTensor<Self>, _: Frame, _: bool) -> Backward<Self> {
+    fn render_backward(
+        _: Parameters<Self>,
+        _: Saved<Self>,
+        _: FloatTensor<Self>,
+        _: Frame,
+        _: Wanted,
+    ) -> Backward<Self> {
         panic!("the renderer has no second derivative: call `backward` once per frame")
     }
 }

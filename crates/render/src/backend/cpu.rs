@@ -1,11 +1,12 @@
 //! The renderer on the CPU backends: tensors to slices, slices through the kernels, slices to tensors.
 
 use super::host::{HostTensors, shape_of};
-use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved};
+use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved, Wanted};
 use crate::cluster::clusters;
 use crate::error::Result;
 use crate::kernels::cpu::{
     bin::{BinExtras, TileGrid, TileLists, bin},
+    pose_bwd::pose_bwd,
     project::{GaussianSlices, ProjectedSplats, project},
     project_bwd::project_bwd,
     rasterize::{Raster, rasterize},
@@ -150,7 +151,7 @@ fn backward<B: HostTensors>(
     saved: &Saved<B>,
     v_image: &FloatTensor<B>,
     frame: &Frame,
-    with_probe: bool,
+    wanted: Wanted,
 ) -> Backward<B> {
     let [ids, offsets, pairs, record_offsets, records, ends] = [
         &saved.global_from_compact,
@@ -183,9 +184,12 @@ fn backward<B: HostTensors>(
         ..Raster::default()
     };
     let v_image = B::f32_slice(v_image);
-    let pairs = rasterize_bwd(splats.rows(), &lists, &frame.raster, &raster, &v_image, with_probe);
-    let v =
-        with_slices(parameters, frame.sh_degree, |g| project_bwd(g, &frame.view, &splats, &lists, &pairs, with_probe));
+    let pairs = rasterize_bwd(splats.rows(), &lists, &frame.raster, &raster, &v_image, wanted.means2d);
+    let (v, pose) = with_slices(parameters, frame.sh_degree, |g| {
+        let v = project_bwd(g, &frame.view, &splats, &lists, &pairs, wanted.means2d);
+        let pose = wanted.pose.then(|| pose_bwd(g, &frame.view, &splats.global_from_compact, &v));
+        (v, pose.map_or_else(Vec::new, Vec::from))
+    });
     let shape = |t: &FloatTensor<B>| shape_of::<B>(t);
     let probe_rows = v.probe.len() / 4;
     Backward {
@@ -196,7 +200,10 @@ fn backward<B: HostTensors>(
             opacity_logits: B::f32_tensor(v.opacity_logits, &shape(&parameters.opacity_logits)),
             sh: B::f32_tensor(v.sh, &shape(&parameters.sh)),
         },
-        probe: Probe { means2d: B::f32_tensor(v.probe, &[probe_rows, 4]) },
+        probe: Probe {
+            means2d: B::f32_tensor(v.probe, &[probe_rows, 4]),
+            pose: B::f32_tensor(pose, &[if wanted.pose { 6 } else { 0 }]),
+        },
     }
 }
 
@@ -213,9 +220,9 @@ macro_rules! host_render_ops {
                 saved: Saved<Self>,
                 v_image: FloatTensor<Self>,
                 frame: Frame,
-                with_probe: bool,
+                wanted: Wanted,
             ) -> Backward<Self> {
-                backward(&parameters, &saved, &v_image, &frame, with_probe)
+                backward(&parameters, &saved, &v_image, &frame, wanted)
             }
         }
     };

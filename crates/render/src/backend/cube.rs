@@ -1,12 +1,13 @@
 //! The renderer on GPUs: tensors to buffers, buffers through the kernels, buffers to tensors.
 
-use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved};
+use super::{Backward, Forward, Frame, Parameters, Probe, RenderOps, Saved, Wanted};
 use crate::error::Result;
 use crate::gpu::packed::PackedLayout;
 use crate::gpu::{Gpu, contiguous};
 use crate::kernels::cpu::bin::TileGrid;
 use crate::kernels::gpu::{
     bin::{TileLists, bin},
+    pose_bwd::pose_bwd,
     project::{GaussianBuffers, project},
     project_bwd::project_bwd,
     rasterize::{Raster, rasterize},
@@ -111,7 +112,7 @@ fn backward(
     saved: Saved<CubeBackend>,
     v_image: CubeTensor,
     frame: &Frame,
-    with_probe: bool,
+    wanted: Wanted,
 ) -> Result<Backward<CubeBackend>> {
     let gpu = Gpu::of(&v_image);
     let g = GaussianBuffers::new(parameters, frame.sh_degree);
@@ -131,9 +132,10 @@ fn backward(
     let v_image = contiguous(v_image);
     let raster =
         Raster { image: v_image.clone(), final_t: saved.final_t, stop: saved.stop, tile_ends: saved.tile_ends };
-    let records = rasterize_bwd(&gpu, &lists, &frame.raster, &raster, v_image, with_probe)?;
-    let v = project_bwd(&gpu, &g, &frame.view, &lists, records, with_probe)?;
-    Ok(Backward { parameters: v.layout.views(&v.packed), probe: Probe { means2d: v.probe } })
+    let records = rasterize_bwd(&gpu, &lists, &frame.raster, &raster, v_image, wanted.means2d)?;
+    let v = project_bwd(&gpu, &g, &frame.view, &lists, records, wanted.means2d)?;
+    let pose = if wanted.pose { pose_bwd(&gpu, &g, &frame.view, &lists, &v)? } else { nothing(&gpu, DType::F32) };
+    Ok(Backward { parameters: v.layout.views(&v.packed), probe: Probe { means2d: v.probe, pose } })
 }
 
 impl RenderOps for CubeBackend {
@@ -159,10 +161,10 @@ impl RenderOps for CubeBackend {
         saved: Saved<Self>,
         v_image: FloatTensor<Self>,
         frame: Frame,
-        with_probe: bool,
+        wanted: Wanted,
     ) -> Backward<Self> {
         // Autodiff cannot hand on an error: `draw` has checked these sizes for a frame that is kept.
-        backward(parameters, saved, v_image, &frame, with_probe)
+        backward(parameters, saved, v_image, &frame, wanted)
             .expect("the forward pass has checked the sizes of the backward pass")
     }
 }

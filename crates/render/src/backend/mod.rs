@@ -89,20 +89,32 @@ pub struct Saved<B: Backend> {
     pub stop: IntTensor<B>,
 }
 
-/// What asks for image-plane gradients: nothing, or a leaf that receives them.
+/// What asks for gradients beside those of the parameters: nothing, or leaves that receive them.
 #[derive(Debug, Clone, ExtensionType)]
 pub struct Probe<B: Backend> {
-    /// `[N, 4]`, or `[0, 4]` if nobody asks.
+    /// Of the image-plane means, `[N, 4]`, or `[0, 4]` if nobody asks.
     pub means2d: FloatTensor<B>,
+    /// Of the camera's pose, `[6]`, or `[0]` if nobody asks.
+    pub pose: FloatTensor<B>,
 }
 
-/// Gradients of a frame, shapes as in [`Parameters`]; the probe's is `[N, 4]` or `[0, 4]`.
+/// Which gradients beside those of the parameters somebody asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Wanted {
+    /// Those of the image-plane means.
+    pub means2d: bool,
+    /// That of the camera's pose.
+    pub pose: bool,
+}
+
+/// Gradients of a frame, shapes as in [`Parameters`] and [`Probe`].
 #[derive(Debug, Clone, ExtensionType)]
 pub struct Backward<B: Backend> {
     /// Gradients of the parameters.
     #[extension_type]
     pub parameters: Parameters<B>,
-    /// Image-plane gradient (x, y) in pixels and the sums of its per-pixel magnitudes.
+    /// Image-plane gradient (x, y) in pixels and the sums of its per-pixel magnitudes; gradient of the pose as a twist from
+    /// the left, (ω, v), per radian and world unit.
     #[extension_type]
     pub probe: Probe<B>,
 }
@@ -123,6 +135,6 @@ pub trait RenderOps: Backend {
         #[extension_type] saved: Saved<Self>,
         v_image: FloatTensor<Self>,
         frame: Frame,
-        with_probe: bool,
+        wanted: Wanted,
     ) -> Backward<Self>;
 }

@@ -25,6 +25,7 @@ pub mod covariance;
 pub mod ewa;
 pub mod footprint;
 pub mod frustum;
+pub mod pose;
 pub mod quat;
 pub mod sh;
 pub mod tile;

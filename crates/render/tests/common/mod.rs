@@ -5,8 +5,8 @@ pub mod scenes;
 use burn::tensor::{Device, Tensor, TensorData};
 use gazesplat_core::{Camera, GaussianCloud};
 use gazesplat_render::{
-    ColorMax, MeansProbe, Pass, RenderOptions, RenderStats, Rendered, Residual, SplatStats, Splats, Termination,
-    TerminationLut, cpu_device, render, render_probed,
+    ColorMax, MeansProbe, Pass, PoseProbe, Probes, RenderOptions, RenderStats, Rendered, Residual, SplatStats, Splats,
+    Termination, TerminationLut, cpu_device, render, render_with,
 };
 use gazesplat_testkit::reference;
 use std::cell::RefCell;
@@ -50,10 +50,12 @@ pub struct Gradients {
     pub sh: Vec<f32>,
     /// `[N, 4]`: gradient of the image-plane mean in pixels, and the sums of its absolute values over pixels.
     pub means2d: Vec<f32>,
+    /// `[6]`: of the camera's pose as a twist from the left, (ω, v).
+    pub pose: Vec<f32>,
 }
 
 impl Gradients {
-    /// Names and values of all groups.
+    /// Names and values of all groups of rows.
     pub fn groups(&self) -> [(&'static str, &[f32]); 6] {
         [
             ("means", &self.means),
@@ -71,9 +73,10 @@ impl Gradients {
         for (name, values) in self.groups() {
             gazesplat_testkit::close::assert_finite(&format!("{what}: gradient of {name}"), values);
         }
+        gazesplat_testkit::close::assert_finite(&format!("{what}: gradient of the pose"), &self.pose);
     }
 
-    /// Rows `keep` of every group.
+    /// Rows `keep` of every group; the pose has none.
     pub fn rows(&self, keep: &[usize]) -> Self {
         let n = self.opacity_logits.len();
         let pick = |values: &[f32]| {
@@ -87,6 +90,7 @@ impl Gradients {
             opacity_logits: pick(&self.opacity_logits),
             sh: pick(&self.sh),
             means2d: pick(&self.means2d),
+            pose: self.pose.clone(),
         }
     }
 }
@@ -147,7 +151,8 @@ pub fn devices() -> Vec<(&'static str, Device)> {
     devices
 }
 
-fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+/// Values of a tensor.
+pub fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().try_to_vec().expect("tensors of the renderer are f32")
 }
 
@@ -215,9 +220,10 @@ impl Scene {
         let device = device.clone().autodiff();
         let n = self.cloud.len();
         let splats = Splats::from_cloud(&self.cloud, &device).expect("it fits").require_grad();
-        let probe = MeansProbe::new(n, &device);
+        let (probe, pose) = (MeansProbe::new(n, &device), PoseProbe::new(&device));
+        let probes = Probes { means: Some(&probe), pose: Some(&pose) };
         let options = RenderOptions { pass: training(self.options.pass), ..self.options.clone() };
-        let out = render_probed(&splats, &probe, &self.camera, &options).expect("the scene is legal");
+        let out = render_with(&splats, probes, &self.camera, &options).expect("the scene is legal");
         let grads = loss(&out).backward();
         let frame = self.collect(host(out.image), out.stats, out.splat_stats);
         fn values<const D: usize>(gradient: Option<Tensor<D>>, len: usize) -> Vec<f32> {
@@ -230,6 +236,7 @@ impl Scene {
             opacity_logits: values(splats.opacity_logits.grad(&grads), n),
             sh: values(splats.sh.grad(&grads), 3 * n * self.cloud.num_coefficients()),
             means2d: values(probe.gradient(&grads), 4 * n),
+            pose: values(pose.gradient(&grads), 6),
         };
         (frame, gradients)
     }

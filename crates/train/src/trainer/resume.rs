@@ -1,13 +1,14 @@
 //! Checkpoints of a trainer: what of a run is no function of its seed and step.
 //!
-//! That is the model with its moments, the step, when the rows were last sorted, and with how many Gaussians the run
-//! began. Views, backgrounds, noise and draws are counter-based, so on a CPU a resumed run ends in the same bytes.
+//! That is the model with its moments, the step, when the rows were last sorted, with how many Gaussians the run began, and
+//! the corrections of the poses. Views, backgrounds, noise and draws are counter-based, so on a CPU a resumed run ends in the same bytes.
 
 use super::{Trainer, check_scene};
 use crate::checkpoint::{self, differences, fingerprint_of_cameras};
 use crate::config::Config;
 use crate::error::{Error, Result};
 use crate::optim::{AdamSettings, ModelState};
+use crate::poses::ViewPose;
 use burn::tensor::Device;
 use gazesplat_core::dataset::Dataset;
 use gazesplat_core::io::images::ImageCache;
@@ -31,6 +32,9 @@ struct Record<N> {
     step: u32,
     sorted_at: u32,
     num_initial: usize,
+    /// Corrections of the poses, if they are refined.
+    #[serde(default)]
+    poses: Option<Vec<ViewPose>>,
     noted: N,
 }
 
@@ -53,6 +57,7 @@ impl Trainer {
     /// When the device does not answer, an earlier step failed, or the file cannot be written.
     pub fn save(&mut self, path: &Path, noted: &impl Serialize) -> Result<()> {
         self.settle()?;
+        self.settle_poses()?;
         let record = Record {
             version: env!("CARGO_PKG_VERSION").to_owned(),
             config: self.config.clone(),
@@ -60,6 +65,7 @@ impl Trainer {
             step: self.step,
             sorted_at: self.sorted_at,
             num_initial: self.num_initial,
+            poses: self.recorded_poses(),
             noted,
         };
         let state = self.state.snapshot()?.to_host()?;
@@ -83,7 +89,7 @@ impl Trainer {
         let mut loaded: checkpoint::Loaded<Record<N>> = checkpoint::load(path, KIND, &["state"])?;
         let refuse = |message: String| Error::Checkpoint { path: path.to_owned(), message };
         let state = loaded.take("state").ok_or_else(|| refuse("damaged: the model is missing".to_owned()))?;
-        let Record { version, config: recorded, origin, step, sorted_at, num_initial, noted } = loaded.meta;
+        let Record { version, config: recorded, origin, step, sorted_at, num_initial, poses, noted } = loaded.meta;
         let current = env!("CARGO_PKG_VERSION");
         if version != current {
             return Err(refuse(format!("it is of version {version}, this is {current}")));
@@ -100,6 +106,9 @@ impl Trainer {
         if origin != expected {
             let what = if origin.views == expected.views { "with other cameras" } else { "on other views" };
             return Err(refuse(format!("it is of a run {what}")));
+        }
+        if !trainer.restore_poses(poses) {
+            return Err(refuse("damaged: its camera poses are not those of its views".to_owned()));
         }
         (trainer.step, trainer.sorted_at) = (step, sorted_at);
         Ok((trainer, noted))
@@ -204,6 +213,48 @@ mod tests {
             trainer = again;
         }
         assert!(end(trainer) == expected);
+    }
+
+    /// Everything of [`end`], and the corrections of the poses.
+    fn end_with_poses(mut trainer: Trainer) -> (crate::optim::HostState, Vec<ViewPose>) {
+        while trainer.step < trainer.config.train.steps {
+            trainer.step().expect("trains");
+        }
+        trainer.settle_poses().expect("readable");
+        let poses = trainer.recorded_poses().expect("asked for");
+        (trainer.state.snapshot().and_then(|s| s.to_host()).expect("readable"), poses)
+    }
+
+    /// At, before and after the ends of epochs of six views, and on a GPU where gradients of poses still wait to be read.
+    #[test]
+    fn refined_poses_are_resumed_bit_for_bit() {
+        let (dir, dataset) = scene(7);
+        let mut config = config();
+        (config.train.steps, config.train.refine_poses, config.poses.start) = (50, true, 3000);
+        let mut devices = vec![cpu_device()];
+        devices.extend(required_gpu(gpu_device(None)));
+        for device in devices {
+            let fresh = || Trainer::new(&dataset, images(&dataset), &config, &device).expect("valid");
+            let expected = end_with_poses(fresh());
+            assert!(expected.1.iter().all(|pose| pose.num_updates > 5 && pose.twist != [0.0; 6]), "{:?}", expected.1);
+            let path = dir.path().join("checkpoint");
+            let mut trainer = fresh();
+            for stop in [0, 3, 5, 6, 7, 11, 12, 20, 33, 48, 49, 50] {
+                while trainer.step < stop {
+                    trainer.step().expect("trains");
+                }
+                trainer.save(&path, &"noted").expect("writable");
+                trainer = resumed(&dataset, &config, &device, &path).expect("valid").0;
+            }
+            assert!(end_with_poses(trainer) == expected);
+        }
+        // Records that fit no run of these settings.
+        let mut trainer = Trainer::new(&dataset, images(&dataset), &config, &cpu_device()).expect("valid");
+        assert!(!trainer.restore_poses(None) && !trainer.restore_poses(Some(vec![ViewPose::default(); 5])));
+        assert!(trainer.restore_poses(Some(vec![ViewPose::default(); 6])));
+        config.train.refine_poses = false;
+        let mut trainer = Trainer::new(&dataset, images(&dataset), &config, &cpu_device()).expect("valid");
+        assert!(!trainer.restore_poses(Some(vec![ViewPose::default(); 6])) && trainer.restore_poses(None));
     }
 
     /// The device repeats its bits from run to run, so that the tolerance is none.

@@ -6,6 +6,7 @@
 
 pub mod bin;
 pub mod lut;
+pub mod pose_bwd;
 pub mod project;
 pub mod project_bwd;
 pub mod rasterize;

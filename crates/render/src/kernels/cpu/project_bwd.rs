@@ -190,12 +190,20 @@ fn sh_gradient(
 ) -> Vec3 {
     let mut basis = [0.0; MAX_COEFFICIENTS];
     sh_basis(g.sh_degree, direction.unit, &mut basis);
-    let mut v_basis = [0.0f32; MAX_COEFFICIENTS];
-    for (((v_row, row), b), v_b) in v_sh.iter_mut().zip(g.coefficients(i)).zip(&basis).zip(&mut v_basis) {
+    for (v_row, b) in v_sh.iter_mut().zip(&basis[..g.coefficients(i).len()]) {
         *v_row = v_color.map(|v| v * b);
+    }
+    view_direction_vjp(*direction, color_direction_vjp(g, i, direction.unit, v_color))
+}
+
+/// Gradient of the colour of Gaussian `i` with respect to the unit direction it is seen in, as three free variables.
+#[inline(always)]
+pub(super) fn color_direction_vjp(g: &GaussianSlices<'_>, i: usize, unit: Vec3, v_color: &[f32; 3]) -> Vec3 {
+    let mut v_basis = [0.0f32; MAX_COEFFICIENTS];
+    for (row, v_b) in g.coefficients(i).iter().zip(&mut v_basis) {
         *v_b = v_color[0] * row[0] + v_color[1] * row[1] + v_color[2] * row[2];
     }
-    let Vec3 { x, y, z } = direction.unit;
+    let Vec3 { x, y, z } = unit;
     let mut v = Vec3 { x: 0.0, y: 0.0, z: 0.0 };
     let mut add = |g: Vec3| v = Vec3 { x: v.x + g.x, y: v.y + g.y, z: v.z + g.z };
     let [_, a1, a2, a3, b0, b1, b2, b3, b4, c0, c1, c2, c3, c4, c5, c6, d @ ..] = v_basis;
@@ -212,5 +220,5 @@ fn sh_gradient(
         let [m0, m1, m2, m3, m4, m5, m6, m7, m8] = d;
         add(sh::band4_vjp(x, y, z, sh::Band4 { m0, m1, m2, m3, m4, m5, m6, m7, m8 }));
     }
-    view_direction_vjp(*direction, v)
+    v
 }

@@ -214,7 +214,7 @@ fn project_bwd_kernel(
         z: v_projected[row + lane::RED + 2],
     };
     let direction = view_direction(view, mean);
-    let v_direction = sh_direction_gradient(sh, i * num_sh, direction.unit, v_color, sh_degree);
+    let v_direction = color_direction_vjp(sh, i * num_sh, direction.unit, v_color, sh_degree);
     let through_color = view_direction_vjp(direction, v_direction);
     let v_mean = Vec3 { x: v.mean.x + through_color.x, y: v.mean.y + through_color.y, z: v.mean.z + through_color.z };
     // v is ∂L/∂ln o, compensated or not, and ∂ ln o/∂logit = 1 − o = σ(−logit), which keeps its digits where o is close to 1.
@@ -263,7 +263,7 @@ fn v_basis(sh: &[f32], first: usize, v_color: Vec3, #[comptime] k: usize) -> f32
 
 /// Gradient of the colour with respect to the unit direction `d`, as three free variables.
 #[cube]
-fn sh_direction_gradient(sh: &[f32], first: usize, d: Vec3, v: Vec3, #[comptime] degree: u32) -> Vec3 {
+pub fn color_direction_vjp(sh: &[f32], first: usize, d: Vec3, v: Vec3, #[comptime] degree: u32) -> Vec3 {
     let mut x = 0.0_f32;
     let mut y = 0.0_f32;
     let mut z = 0.0_f32;

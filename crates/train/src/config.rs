@@ -207,6 +207,10 @@ pub struct OptimSection {
     pub sh_rest_divisor: f32,
     /// Steps between two rises of the SH degree, for a run of 30,000 steps; scaled with `train.steps`. Default 1000.
     pub sh_degree_every: u32,
+    /// Leave the SH coefficients of Gaussians that no view sees as they are until one does, and then do what they have
+    /// missed in closed form: the result is that of `false` but for rounding, in less time and memory traffic where a view
+    /// sees a part of the model only. From update 512 on. Default false.
+    pub visible_only: bool,
 }
 
 impl Default for OptimSection {
@@ -220,6 +224,7 @@ impl Default for OptimSection {
             sh_dc_lr: 2.5e-3,
             sh_rest_divisor: 20.0,
             sh_degree_every: 1000,
+            visible_only: false,
         }
     }
 }

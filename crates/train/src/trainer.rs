@@ -20,7 +20,7 @@ use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
 use crate::kernels::cpu::rows::Rows;
 use crate::limits::check_limits;
 use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses, scale_decay};
-use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, Snapshot, schedule};
+use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, ShRates, Snapshot, schedule};
 use crate::rng::{Stream, draw, permutation, uniform};
 use burn::tensor::{Device, Gradients, Tensor};
 use gazesplat_core::dataset::Dataset;
@@ -112,6 +112,11 @@ impl Trainer {
             StrategyKind::None => Box::new(Fixed),
         };
         let losses = WeightedLosses::default().with(1.0, Box::new(L1Ssim { ssim_weight: config.loss.ssim_weight }));
+        let mut state = state;
+        if config.optim.visible_only {
+            let LearningRates { sh_dc: dc, sh_rest: rest, .. } = LearningRates::at(&config.optim, 0, 1, extent);
+            state.let_unseen_lag(ShRates { dc, rest });
+        }
         Self {
             test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
             config: config.clone(),
@@ -194,8 +199,11 @@ impl Trainer {
     }
 
     /// The model as it is now; later steps leave these tensors as they are.
-    pub fn splats(&self) -> Splats {
-        self.state.splats()
+    ///
+    /// # Errors
+    /// [`Error::Render`] when the device lacks the memory to bring rows that lag up to date.
+    pub fn splats(&self) -> Result<Splats> {
+        self.state.current()
     }
 
     /// Number of Gaussians N.
@@ -233,7 +241,7 @@ impl Trainer {
     /// # Errors
     /// [`Error::Render`] when the device does not answer.
     pub fn to_cloud(&self) -> Result<GaussianCloud> {
-        self.exported(&self.state.lent())
+        self.exported(&self.state.current_lent()?)
     }
 
     /// [`Trainer::to_cloud`] of another state of the model.
@@ -250,7 +258,7 @@ impl Trainer {
     /// As [`evaluate`]; on a GPU, [`Error::NonFiniteLoss`] of an earlier step.
     pub fn evaluate(&mut self) -> Result<EvalReport> {
         self.checked_status()?;
-        evaluate(&self.state.lent(), &self.test_images, &self.config.render_options(), &mut |_, _| {})
+        evaluate(&self.state.current_lent()?, &self.test_images, &self.config.render_options(), &mut |_, _| {})
     }
 
     /// One step on the next view. Views come in a random order, each once before any comes again.
@@ -273,8 +281,10 @@ impl Trainer {
 
         let stats = if self.scale_decay.is_some() { StatsMode::Tiles } else { StatsMode::None };
         let options = RenderOptions { background, pass: Pass::Train, stats, ..self.config.render_options() };
+        let camera = &self.images.views()[view].camera;
+        self.state.prepare(camera, options.near)?;
         let leaves = tracked(&self.state.lent());
-        let Rendered { image, splat_stats, .. } = render(&leaves, &self.images.views()[view].camera, &options)?;
+        let Rendered { image, splat_stats, .. } = render(&leaves, camera, &options)?;
         stage_ms.forward = clock.lap();
 
         let pending = self.losses.evaluate(image, &target).expect("a trainer has a loss");

@@ -27,6 +27,10 @@ pub struct LearningRates {
 }
 
 impl LearningRates {
+    /// Rates of 0.
+    pub const NONE: Self =
+        Self { means: 0.0, quats: 0.0, log_scales: 0.0, opacity_logits: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
+
     /// Rates at `step` (counted from 0) of `num_steps`, in a scene of radius `extent` world units.
     pub fn at(section: &OptimSection, step: u32, num_steps: u32, extent: f32) -> Self {
         let progress = step as f32 / num_steps.saturating_sub(1).max(1) as f32;

@@ -97,7 +97,7 @@ impl HvsqTerm {
     /// When the pools are larger than a photograph.
     pub fn register(&self, trainer: &mut Trainer) -> Result<Option<Arc<ReferenceCache>>> {
         let device = trainer.splats()?.means.device();
-        let Some((loss, cache)) = self.make(trainer.images().views(), &device)? else { return Ok(None) };
+        let Some((loss, cache)) = self.make(&trainer.smallest_views(), &device)? else { return Ok(None) };
         trainer.add_loss(self.weight, loss);
         Ok(Some(cache))
     }

@@ -11,7 +11,7 @@
 //! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`.
 
 use crate::backend::Status;
-use crate::config::{Background, Config, NamedBackground, StrategyKind};
+use crate::config::{Config, StrategyKind};
 use crate::densify::{Fixed, Mcmc, StepContext, Strategy};
 use crate::error::{Error, Offender, Result};
 use crate::evaluate::{EvalReport, evaluate};
@@ -21,16 +21,17 @@ use crate::kernels::cpu::rows::Rows;
 use crate::limits::check_limits;
 use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses, scale_decay};
 use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, ShRates, Snapshot, schedule};
-use crate::rng::{Stream, draw, permutation, uniform};
 use burn::tensor::{Device, Gradients, Tensor};
 use gazesplat_core::dataset::Dataset;
 use gazesplat_core::io::images::ImageCache;
+use gazesplat_core::io::reduced_images::ReducedImages;
 use gazesplat_core::{Camera, GaussianCloud, sh};
 use gazesplat_render::{Pass, RenderOptions, Rendered, Splats, StatsMode, is_gpu, render};
 use std::sync::Arc;
 use std::time::Instant;
 
 mod resume;
+mod views;
 
 /// γ of scale decay (RTGS Eq. 4).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -59,6 +60,8 @@ pub struct Trainer {
     step: u32,
     /// The epoch whose order is held, and the order.
     view_order: Option<(u32, Vec<usize>)>,
+    /// The photographs of a coarse beginning, and how often their sides are halved.
+    coarse: Option<(u32, Arc<ReducedImages>)>,
     messages: Vec<String>,
 }
 
@@ -131,6 +134,7 @@ impl Trainer {
             extent,
             step: 0,
             view_order: None,
+            coarse: None,
             messages: Vec::new(),
         }
     }
@@ -184,6 +188,7 @@ impl Trainer {
             extent: self.extent,
             step: 0,
             view_order: None,
+            coarse: None,
             messages: Vec::new(),
         })
     }
@@ -272,19 +277,16 @@ impl Trainer {
         let num_steps = self.config.train.steps;
         self.grow_sh()?;
         let view = self.view_at(self.step);
-        let photo = self.images.get(view)?;
-        let next = self.view_at(self.step + 1);
-        self.images.prefetch(next);
+        let (photo, camera) = self.photo(view)?;
         let background = self.background();
         let target = LossTarget::new(photo, background);
         stage_ms.image = clock.lap();
 
         let stats = if self.scale_decay.is_some() { StatsMode::Tiles } else { StatsMode::None };
         let options = RenderOptions { background, pass: Pass::Train, stats, ..self.config.render_options() };
-        let camera = &self.images.views()[view].camera;
-        self.state.prepare(camera, options.near)?;
+        self.state.prepare(&camera, options.near)?;
         let leaves = tracked(&self.state.lent());
-        let Rendered { image, splat_stats, .. } = render(&leaves, camera, &options)?;
+        let Rendered { image, splat_stats, .. } = render(&leaves, &camera, &options)?;
         stage_ms.forward = clock.lap();
 
         let pending = self.losses.evaluate(image, &target).expect("a trainer has a loss");
@@ -367,31 +369,6 @@ impl Trainer {
         match num_coefficients > self.state.num_coefficients() {
             true => self.state.widen_sh(num_coefficients),
             false => Ok(()),
-        }
-    }
-
-    /// The view of step `step`, counted from 0.
-    fn view_at(&mut self, step: u32) -> usize {
-        let num_views = self.images.len() as u32;
-        let (epoch, position) = (step / num_views, (step % num_views) as usize);
-        if self.view_order.as_ref().is_none_or(|(held, _)| *held != epoch) {
-            let order = permutation(self.images.len(), self.config.train.seed, Stream::ViewOrder, epoch);
-            if step != self.step {
-                // A look ahead into the next epoch; the order of this one is still needed.
-                return order[position];
-            }
-            self.view_order = Some((epoch, order));
-        }
-        self.view_order.as_ref().map_or(0, |(_, order)| order[position])
-    }
-
-    fn background(&self) -> [f32; 3] {
-        match self.config.data.background {
-            Background::Named(NamedBackground::Random) => {
-                let words = draw(self.config.train.seed, Stream::Background, self.step, 0);
-                [uniform(words[0]), uniform(words[1]), uniform(words[2])]
-            }
-            fixed => fixed.fixed_rgb(),
         }
     }
 }

@@ -15,6 +15,7 @@ mod locate;
 pub mod model;
 pub mod ply;
 mod quantize;
+pub mod reduced_images;
 pub mod splat;
 pub mod spz;
 pub mod transforms;

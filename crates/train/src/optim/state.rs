@@ -15,6 +15,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 pub(crate) mod lag;
 
+use lag::{placeholder, words_tensor};
+
 /// A model with its optimiser as it was at some moment.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
@@ -369,18 +371,6 @@ impl ModelState {
 fn status_tensor(status: Status, device: &Device) -> burn::backend::tensor::IntTensor<Dispatch> {
     let words = status.to_words().map(u32::cast_signed).to_vec();
     Tensor::<1, Int>::from_data(TensorData::new(words, [Status::NUM_WORDS]), (device, DType::I32)).into_dispatch()
-}
-
-/// Words of rows as a tensor.
-fn words_tensor(words: Vec<u32>, device: &Device) -> burn::backend::tensor::IntTensor<Dispatch> {
-    let len = words.len();
-    let words: Vec<i32> = words.into_iter().map(u32::cast_signed).collect();
-    Tensor::<1, Int>::from_data(TensorData::new(words, [len]), (device, DType::I32)).into_dispatch()
-}
-
-/// What stands in a state where no row lags: a device has no buffer without a word.
-fn placeholder(device: &Device) -> burn::backend::tensor::IntTensor<Dispatch> {
-    words_tensor(vec![0], device)
 }
 
 fn dispatched(s: Splats) -> Parameters<Dispatch> {

@@ -6,12 +6,13 @@
 //! nothing that the dense optimiser does is left out: what a view may see is up to date before the view is drawn, and the
 //! rest before rows are moved or looked at.
 
-use super::{ModelState, Snapshot, placeholder, splats, words_tensor};
+use super::{ModelState, Snapshot, splats};
 use crate::backend::{Changed, MissedUpdates, OptimOps};
 use crate::error::Result;
 use crate::optim::missed::{DENSE_UPDATES, MAX_MISSED};
 use burn::backend::Dispatch;
-use burn::tensor::DType;
+use burn::backend::tensor::IntTensor;
+use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use gazesplat_core::Camera;
 use gazesplat_render::Splats;
 use gazesplat_render::cluster::Frustum;
@@ -165,9 +166,21 @@ pub(crate) fn are_words_valid(words: &[u32], num_updates: u32) -> bool {
     words.iter().all(|word| (oldest..=num_updates).contains(&(word & !crate::optim::missed::PREPARED)))
 }
 
+/// Words of rows as a tensor.
+pub(super) fn words_tensor(words: Vec<u32>, device: &Device) -> IntTensor<Dispatch> {
+    let len = words.len();
+    let words: Vec<i32> = words.into_iter().map(u32::cast_signed).collect();
+    Tensor::<1, Int>::from_data(TensorData::new(words, [len]), (device, DType::I32)).into_dispatch()
+}
+
+/// What stands in a state where no row lags: a device has no buffer without a word.
+pub(super) fn placeholder(device: &Device) -> IntTensor<Dispatch> {
+    words_tensor(vec![0], device)
+}
+
 /// Words of rows as they are on the host.
-pub(super) fn words_of(tensor: burn::backend::tensor::IntTensor<Dispatch>) -> Result<Vec<u32>> {
-    let words = burn::tensor::Tensor::<1, burn::tensor::Int>::from_dispatch(tensor);
+pub(super) fn words_of(tensor: IntTensor<Dispatch>) -> Result<Vec<u32>> {
+    let words = Tensor::<1, Int>::from_dispatch(tensor);
     let data = words.try_into_data().map_err(|e| gazesplat_render::Error::device(&e))?;
     // A GPU copies on the first access: that can fail, too. Its words are unsigned, a CPU's signed: the bits are the same.
     let data = data.convert_dtype(DType::I32);

@@ -110,6 +110,13 @@ impl Observer for TrainProgress<'_> {
                     report.views.len()
                 ));
             }
+            TrainEvent::Resolution { step, num_halvings, size: [width, height] } => {
+                let share =
+                    if *num_halvings == 0 { "full".to_owned() } else { format!("1/{} of the", 1 << num_halvings) };
+                self.console.note(format_args!(
+                    "step {step}: images have {share} size from here on, {width} × {height} pixels"
+                ));
+            }
             TrainEvent::Message(text) => self.console.warn(text),
             TrainEvent::Finished { .. } => self.bar.finish_and_clear(),
             TrainEvent::LoadingImages { .. } | TrainEvent::Densified { .. } => {}

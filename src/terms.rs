@@ -96,8 +96,8 @@ impl HvsqTerm {
     /// # Errors
     /// When the pools are larger than a photograph.
     pub fn register(&self, trainer: &mut Trainer) -> Result<Option<Arc<ReferenceCache>>> {
-        let device = trainer.splats().means.device();
-        let Some((loss, cache)) = self.make(trainer.images().views(), &device)? else { return Ok(None) };
+        let device = trainer.splats()?.means.device();
+        let Some((loss, cache)) = self.make(&trainer.smallest_views(), &device)? else { return Ok(None) };
         trainer.add_loss(self.weight, loss);
         Ok(Some(cache))
     }

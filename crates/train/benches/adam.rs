@@ -1,10 +1,14 @@
-//! One Adam update of all parameter groups, by number of Gaussians (SH degree 3: 59 values each).
+//! One Adam update of all parameter groups, by number of Gaussians (SH degree 3: 59 values each); and one with what comes
+//! before it where SH coefficients of unseen Gaussians lag, when two of five are seen: always the same (`same`), or every
+//! second time others, which have missed an update each (`other`).
 
 use burn::tensor::{Device, Tensor};
 use criterion::{BatchSize, BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use gazesplat_core::{Camera, Pinhole};
 use gazesplat_render::{Splats, cpu_device, device::gpu_device, is_gpu};
 use gazesplat_train::config::OptimSection;
-use gazesplat_train::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers};
+use gazesplat_train::optim::{AdamSettings, Columns, Group, LearningRates, ModelState, Regularizers, ShRates};
+use glam::Vec3;
 
 fn adam(c: &mut Criterion) {
     let mut group = c.benchmark_group("adam");
@@ -20,9 +24,42 @@ fn adam(c: &mut Criterion) {
             group.bench_function(BenchmarkId::new(name, num_gaussians), |b| {
                 b.iter_batched(&mut gradients, |grads| update(&mut state, grads), BatchSize::PerIteration);
             });
+            for (seen, directions) in [("same", [Vec3::X, Vec3::X]), ("other", [Vec3::X, Vec3::Y])] {
+                let mut state = lagging(rows(0.1), &device);
+                let mut turn = 0;
+                group.bench_function(BenchmarkId::new(format!("{name}, {seen} seen"), num_gaussians), |b| {
+                    let step = |grads| {
+                        turn += 1;
+                        state.prepare(&camera(directions[turn % 2]), 0.01).expect("valid");
+                        update(&mut state, grads);
+                    };
+                    b.iter_batched(&mut gradients, step, BatchSize::PerIteration);
+                });
+            }
         }
     }
     group.finish();
+}
+
+fn camera(direction: Vec3) -> Camera {
+    Camera::look_at(Pinhole::from_fov_x(64, 48, 0.8), Vec3::ZERO, direction, Vec3::Z)
+}
+
+/// A model late enough for rows to lag, two of five clusters along x, two along y, one behind.
+fn lagging(mut rows: Columns, device: &Device) -> ModelState {
+    for row in 0..rows.num_rows() {
+        let mean = [[2.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 2.0, 0.0], [-2.0, -2.0, 0.0]];
+        rows.row_mut(Group::Means, row).copy_from_slice(&mean[row / 256 % 5]);
+        rows.row_mut(Group::LogScales, row).fill(-5.0);
+    }
+    let still = Columns { data: rows.data.each_ref().map(|d| vec![0.0; d.len()]), widths: rows.widths };
+    let mut state = ModelState::new(rows, AdamSettings::default(), device).expect("it fits");
+    let rates = LearningRates::at(&OptimSection::default(), 0, 1000, 1.0);
+    state.let_unseen_lag(ShRates { dc: rates.sh_dc, rest: rates.sh_rest });
+    for _ in 0..gazesplat_train::optim::missed::DENSE_UPDATES {
+        update(&mut state, still.clone().into_splats(device));
+    }
+    state
 }
 
 /// One update, and the wait for it.

@@ -5,6 +5,7 @@
 
 use crate::error::{Error, Result};
 use crate::kernels::cpu::rows::Rows;
+use crate::optim::state::lag::are_words_valid;
 use crate::optim::{Columns, Group, HostState};
 use gazesplat_core::io::write_atomically;
 use gazesplat_core::{Camera, GaussianCloud};
@@ -30,6 +31,11 @@ pub fn save(path: &Path, kind: &str, meta: &impl Serialize, states: &[(&str, &Ho
     ]);
     let mut tensors = Vec::new();
     for (name, state) in states {
+        if !state.last.is_empty() {
+            let view = TensorView::new(Dtype::U32, vec![state.last.len()], bytemuck::cast_slice(&state.last))
+                .expect("a word per row");
+            tensors.push((format!("{name}.last"), view));
+        }
         info.insert(format!("{name}.num_updates"), state.num_updates.to_string());
         let Rows { params, first, second } = &state.rows;
         for (part, columns) in [("params", params), ("first", first), ("second", second)] {
@@ -98,9 +104,26 @@ pub fn load<M: DeserializeOwned>(path: &Path, kind: &str, names: &[&str]) -> Res
         {
             return Err(refuse(format!("damaged: the moments of `{name}` do not fit its parameters")));
         }
-        states.push((name.to_owned(), HostState { rows, num_updates }));
+        let last = words(&file, &format!("{name}.last"), rows.num_rows(), num_updates).map_err(refuse)?;
+        states.push((name.to_owned(), HostState { rows, num_updates, last }));
     }
     Ok(Loaded { meta, states })
+}
+
+/// A word per row, or none where no row lags.
+fn words(
+    file: &SafeTensors<'_>,
+    name: &str,
+    num_rows: usize,
+    num_updates: u32,
+) -> std::result::Result<Vec<u32>, String> {
+    let Ok(tensor) = file.tensor(name) else { return Ok(Vec::new()) };
+    let word = |bytes: &[u8]| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
+    let words: Vec<u32> = tensor.data().chunks_exact(4).map(word).collect();
+    match tensor.dtype() == Dtype::U32 && words.len() == num_rows && are_words_valid(&words, num_updates) {
+        true => Ok(words),
+        false => Err(format!("damaged: `{name}` does not fit {num_rows} Gaussians after {num_updates} updates")),
+    }
 }
 
 /// Parameters, or moments of them, under `prefix`.
@@ -193,7 +216,7 @@ mod tests {
         let widths = [3, 4, 3, 1, 12];
         let columns = |add: f32| Columns { data: widths.map(|w| (0..2 * w).map(|i| i as f32 + add).collect()), widths };
         let rows = Rows { params: columns(0.25), first: columns(f32::MIN_POSITIVE), second: columns(f32::EPSILON) };
-        HostState { rows, num_updates: 7 }
+        HostState { rows, num_updates: 7, last: Vec::new() }
     }
 
     #[test]

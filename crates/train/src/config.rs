@@ -55,6 +55,12 @@ pub struct TrainSection {
     /// Corrects the poses of the training views along with the model, and writes them to `poses.json`. For captures whose
     /// poses are not exact: test views keep the ones they are given. Default false.
     pub refine_poses: bool,
+    /// Train from coarse to fine: at first the sides of the images are halved so often, at most 8; 0 = images of full size
+    /// from the beginning. Measurements are always of full size. Default 0.
+    pub num_downscales: u32,
+    /// Steps between two doublings of the image size, for a run of 30,000 steps; scaled with `train.steps`. Times
+    /// `train.num_downscales` it is less than 30000, and the last step has full size in any run. Default 3000.
+    pub resolution_schedule: u32,
 }
 
 impl Default for TrainSection {
@@ -68,6 +74,8 @@ impl Default for TrainSection {
             checkpoint_every: 5000,
             checkpoint_keep: 1,
             refine_poses: false,
+            num_downscales: 0,
+            resolution_schedule: 3000,
         }
     }
 }
@@ -219,6 +227,10 @@ pub struct OptimSection {
     pub sh_rest_divisor: f32,
     /// Steps between two rises of the SH degree, for a run of 30,000 steps; scaled with `train.steps`. Default 1000.
     pub sh_degree_every: u32,
+    /// Leave the SH coefficients of Gaussians that no view sees as they are until one does, and then do what they have
+    /// missed in closed form: the result is that of `false` but for rounding, in less time and memory traffic where a view
+    /// sees a part of the model only. From update 512 on. Default false.
+    pub visible_only: bool,
 }
 
 impl Default for OptimSection {
@@ -232,6 +244,7 @@ impl Default for OptimSection {
             sh_dc_lr: 2.5e-3,
             sh_rest_divisor: 20.0,
             sh_degree_every: 1000,
+            visible_only: false,
         }
     }
 }
@@ -371,6 +384,12 @@ impl Config {
         check(self.train.steps >= 1, "train.steps", &self.train.steps, "at least 1")?;
         check(self.train.log_every >= 1, "train.log_every", &self.train.log_every, "at least 1")?;
         check(self.train.checkpoint_keep >= 1, "train.checkpoint_keep", &self.train.checkpoint_keep, "at least 1")?;
+        let (halvings, every) = (self.train.num_downscales, self.train.resolution_schedule);
+        check(halvings <= 8, "train.num_downscales", &halvings, "0 to 8")?;
+        check(every >= 1, "train.resolution_schedule", &every, "at least 1")?;
+        let coarse = u64::from(halvings) * u64::from(every);
+        let expected = "less than 30000 steps, of 30000, before images have full size";
+        check(coarse < 30_000, "train.num_downscales times train.resolution_schedule", &coarse, expected)?;
         if let Background::Rgb(rgb) = self.data.background {
             for value in rgb {
                 check((0.0..=1.0).contains(&value), "data.background", &value, "three numbers in 0..1")?;
@@ -440,6 +459,19 @@ mod tests {
         assert_eq!(section(300, 5000).eval_interval(20), Some(200));
         assert_eq!(section(3000, 100).eval_interval(7), Some(100));
         assert_eq!(section(3000, 0).eval_interval(7), None);
+    }
+
+    #[test]
+    fn coarse_sizes_that_never_end_are_refused() {
+        let refused = |num_downscales, resolution_schedule| {
+            let mut config = Config::default();
+            config.train = TrainSection { num_downscales, resolution_schedule, ..config.train };
+            config.validate().err().map(|error| error.to_string()).unwrap_or_default()
+        };
+        assert_eq!(refused(2, 3000), "");
+        assert!(refused(9, 100).starts_with("train.num_downscales"));
+        assert!(refused(1, 0).starts_with("train.resolution_schedule"));
+        assert!(refused(3, 10_000).contains("found 30000"), "{}", refused(3, 10_000));
     }
 
     #[test]

@@ -81,6 +81,16 @@ pub enum TrainEvent<'a> {
         /// Test views.
         num_test: usize,
     },
+    /// The next step sees images of another size than the one before: of a part of theirs at the beginning of a run from
+    /// coarse to fine, and of all of it later.
+    Resolution {
+        /// Number of that step, counted from 1.
+        step: u32,
+        /// How often the sides of the images are halved.
+        num_halvings: u32,
+        /// Width and height of the first view, pixels.
+        size: [u32; 2],
+    },
     /// A step is done. Sent for every step; logs take those that [`StepReport::is_logged`] accepts.
     Step(&'a StepReport),
     /// Gaussians were relocated or added.

@@ -3,6 +3,7 @@
 #[cfg(feature = "gpu")]
 use cubecl::prelude::*;
 
+use gazesplat_render::math::frustum::{Side, Sides, excludes, is_beyond};
 use gazesplat_render::math::quat::{Quat, rotation};
 use gazesplat_render::math::vec::{Vec3, dot, row_times};
 
@@ -41,6 +42,14 @@ pub fn excess_tiles(used: u32) -> f32 {
         excess = used - FREE_TILES;
     }
     excess as f32
+}
+
+/// Whether a view with the half-spaces `sides` and `front` may see a Gaussian with largest standard deviation `scale`; true
+/// where a value is not finite.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn may_be_seen(sides: Sides, front: Side, mean: Vec3, scale: f32) -> bool {
+    !is_beyond(front, mean, scale) && !excludes(sides, mean, scale)
 }
 
 /// Steepness of the gate of position noise (MCMC, Eq. 8).

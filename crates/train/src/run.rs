@@ -45,6 +45,9 @@ pub fn run(trainer: &mut Trainer, observers: &mut [&mut dyn Observer], stop: &At
         if stop.load(Ordering::Relaxed) {
             return Ok(Outcome::Stopped);
         }
+        if let Some((num_halvings, size)) = trainer.resolution_change() {
+            emit(observers, &TrainEvent::Resolution { step: trainer.step_index() + 1, num_halvings, size })?;
+        }
         let report = trainer.step()?;
         emit(observers, &TrainEvent::Step(&report))?;
         if let Some(densified) = &report.densified {

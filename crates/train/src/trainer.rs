@@ -11,7 +11,7 @@
 //! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`.
 
 use crate::backend::Status;
-use crate::config::{Background, Config, NamedBackground, StrategyKind};
+use crate::config::{Config, StrategyKind};
 use crate::densify::{Fixed, Mcmc, StepContext, Strategy};
 use crate::error::{Error, Offender, Result};
 use crate::evaluate::{EvalReport, evaluate};
@@ -20,11 +20,11 @@ use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
 use crate::kernels::cpu::rows::Rows;
 use crate::limits::check_limits;
 use crate::losses::{L1Ssim, LossTarget, LossTerm, WeightedLosses, scale_decay};
-use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, Snapshot, schedule};
-use crate::rng::{Stream, draw, permutation, uniform};
+use crate::optim::{AdamSettings, Columns, LearningRates, ModelState, Regularizers, ShRates, Snapshot, schedule};
 use burn::tensor::{Device, Gradients, Tensor};
 use gazesplat_core::dataset::Dataset;
 use gazesplat_core::io::images::ImageCache;
+use gazesplat_core::io::reduced_images::ReducedImages;
 use gazesplat_core::{Camera, GaussianCloud, sh};
 use gazesplat_render::{Pass, Probes, RenderOptions, Rendered, Splats, StatsMode, is_gpu, render_with};
 use std::sync::Arc;
@@ -32,6 +32,7 @@ use std::sync::Arc;
 mod clock;
 mod poses;
 mod resume;
+mod views;
 
 use clock::Clock;
 use poses::Poses;
@@ -65,6 +66,8 @@ pub struct Trainer {
     step: u32,
     /// The epoch whose order is held, and the order.
     view_order: Option<(u32, Vec<usize>)>,
+    /// The photographs of a coarse beginning, and how often their sides are halved.
+    coarse: Option<(u32, Arc<ReducedImages>)>,
     messages: Vec<String>,
 }
 
@@ -118,6 +121,11 @@ impl Trainer {
             StrategyKind::None => Box::new(Fixed),
         };
         let losses = WeightedLosses::default().with(1.0, Box::new(L1Ssim { ssim_weight: config.loss.ssim_weight }));
+        let mut state = state;
+        if config.optim.visible_only {
+            let LearningRates { sh_dc: dc, sh_rest: rest, .. } = LearningRates::at(&config.optim, 0, 1, extent);
+            state.let_unseen_lag(ShRates { dc, rest });
+        }
         let mut trainer = Self {
             test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
             config: config.clone(),
@@ -133,6 +141,7 @@ impl Trainer {
             extent,
             step: 0,
             view_order: None,
+            coarse: None,
             messages: Vec::new(),
         };
         trainer.poses = Poses::of(&trainer);
@@ -189,6 +198,7 @@ impl Trainer {
             extent: self.extent,
             step: 0,
             view_order: None,
+            coarse: None,
             messages: Vec::new(),
         })
     }
@@ -204,8 +214,11 @@ impl Trainer {
     }
 
     /// The model as it is now; later steps leave these tensors as they are.
-    pub fn splats(&self) -> Splats {
-        self.state.splats()
+    ///
+    /// # Errors
+    /// [`Error::Render`] when the device lacks the memory to bring rows that lag up to date.
+    pub fn splats(&self) -> Result<Splats> {
+        self.state.current()
     }
 
     /// Number of Gaussians N.
@@ -243,7 +256,7 @@ impl Trainer {
     /// # Errors
     /// [`Error::Render`] when the device does not answer.
     pub fn to_cloud(&self) -> Result<GaussianCloud> {
-        self.exported(&self.state.lent())
+        self.exported(&self.state.current_lent()?)
     }
 
     /// [`Trainer::to_cloud`] of another state of the model.
@@ -260,7 +273,7 @@ impl Trainer {
     /// As [`evaluate`]; on a GPU, [`Error::NonFiniteLoss`] of an earlier step.
     pub fn evaluate(&mut self) -> Result<EvalReport> {
         self.checked_status()?;
-        evaluate(&self.state.lent(), &self.test_images, &self.config.render_options(), &mut |_, _| {})
+        evaluate(&self.state.current_lent()?, &self.test_images, &self.config.render_options(), &mut |_, _| {})
     }
 
     /// One step on the next view. Views come in a random order, each once before any comes again.
@@ -274,18 +287,17 @@ impl Trainer {
         let num_steps = self.config.train.steps;
         self.grow_sh()?;
         let view = self.view_at(self.step);
-        let photo = self.images.get(view)?;
-        let next = self.view_at(self.step + 1);
-        self.images.prefetch(next);
+        let (photo, camera) = self.photo(view)?;
+        let (camera, pose) = self.camera_of(view, camera)?;
+        let probes = Probes { pose: pose.as_ref(), ..Probes::default() };
         let background = self.background();
         let target = LossTarget::new(photo, background);
         stage_ms.image = clock.lap();
 
         let stats = if self.scale_decay.is_some() { StatsMode::Tiles } else { StatsMode::None };
         let options = RenderOptions { background, pass: Pass::Train, stats, ..self.config.render_options() };
+        self.state.prepare(&camera, options.near)?;
         let leaves = tracked(&self.state.lent());
-        let (camera, pose) = self.camera_of(view)?;
-        let probes = Probes { pose: pose.as_ref(), ..Probes::default() };
         let Rendered { image, splat_stats, .. } = render_with(&leaves, probes, &camera, &options)?;
         stage_ms.forward = clock.lap();
 
@@ -373,31 +385,6 @@ impl Trainer {
         match num_coefficients > self.state.num_coefficients() {
             true => self.state.widen_sh(num_coefficients),
             false => Ok(()),
-        }
-    }
-
-    /// The view of step `step`, counted from 0.
-    fn view_at(&mut self, step: u32) -> usize {
-        let num_views = self.images.len() as u32;
-        let (epoch, position) = (step / num_views, (step % num_views) as usize);
-        if self.view_order.as_ref().is_none_or(|(held, _)| *held != epoch) {
-            let order = permutation(self.images.len(), self.config.train.seed, Stream::ViewOrder, epoch);
-            if step != self.step {
-                // A look ahead into the next epoch; the order of this one is still needed.
-                return order[position];
-            }
-            self.view_order = Some((epoch, order));
-        }
-        self.view_order.as_ref().map_or(0, |(_, order)| order[position])
-    }
-
-    fn background(&self) -> [f32; 3] {
-        match self.config.data.background {
-            Background::Named(NamedBackground::Random) => {
-                let words = draw(self.config.train.seed, Stream::Background, self.step, 0);
-                [uniform(words[0]), uniform(words[1]), uniform(words[2])]
-            }
-            fixed => fixed.fixed_rgb(),
         }
     }
 }

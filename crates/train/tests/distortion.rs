@@ -71,7 +71,7 @@ fn quality(dataset: &Dataset, measured: &Dataset) -> f64 {
     let mut trainer = Trainer::new(dataset, images, &config, &cpu_device()).unwrap();
     run(&mut trainer, &mut [], &AtomicBool::new(false)).unwrap();
     let views = ImageCache::new(measured.test.clone(), config.data.cache_bytes);
-    evaluate(&trainer.splats(), &views, &config.render_options(), &mut |_, _| {}).unwrap().psnr
+    evaluate(&trainer.splats().unwrap(), &views, &config.render_options(), &mut |_, _| {}).unwrap().psnr
 }
 
 /// Loss in dB of a capture through `lens` against its pinhole twin, measured on the twin's test photographs.

@@ -92,7 +92,7 @@ impl Observer for Log {
             TrainEvent::Evaluated { report, .. } => self.psnr = Some(report.psnr),
             TrainEvent::Densified { .. } => self.num_densified += 1,
             TrainEvent::Finished { .. } => self.finished = true,
-            TrainEvent::Started { .. } | TrainEvent::LoadingImages { .. } => {}
+            TrainEvent::Started { .. } | TrainEvent::LoadingImages { .. } | TrainEvent::Resolution { .. } => {}
         }
         Ok(())
     }
@@ -124,7 +124,7 @@ fn a_short_run_on_the_room_reaches_its_quality_floor() {
     let outcome = run(&mut trainer, &mut [&mut log], &AtomicBool::new(false)).unwrap();
     assert_eq!(outcome, Outcome::Finished);
     assert!(log.finished && log.num_densified > 0);
-    assert_eq!(trainer.splats().len(), 6000);
+    assert_eq!(trainer.splats().unwrap().len(), 6000);
     let psnr = log.psnr.unwrap();
     println!("test PSNR {:.2} dB, before training {:.2} dB", psnr, before.psnr);
     assert!(psnr > PSNR_FLOOR_DB && psnr > before.psnr + 3.0, "{psnr} {}", before.psnr);
@@ -176,7 +176,7 @@ fn a_scene_without_points_starts_at_random_and_says_so() {
     let mut settings = config(30, 4000);
     settings.init.random_points = 2000;
     let mut trainer = trainer(&dataset, &settings);
-    assert_eq!(trainer.splats().len(), 2000);
+    assert_eq!(trainer.splats().unwrap().len(), 2000);
     let mut log = Log::default();
     run(&mut trainer, &mut [&mut log], &AtomicBool::new(false)).unwrap();
     assert!(log.messages.iter().any(|m| m.contains("random")), "{:?}", log.messages);
@@ -192,7 +192,7 @@ fn on_cpu_and_gpu(name: &str, config: &Config) -> Option<[(Log, f64, GaussianClo
         let mut log = Log::default();
         run(&mut trainer, &mut [&mut log], &AtomicBool::new(false)).unwrap();
         let options = config.render_options();
-        let trained = evaluate(&trainer.splats(), trainer.images(), &options, &mut |_, _| {}).unwrap();
+        let trained = evaluate(&trainer.splats().unwrap(), trainer.images(), &options, &mut |_, _| {}).unwrap();
         let cloud = trainer.to_cloud().unwrap();
         cloud.validate().unwrap();
         (log, trained.psnr, cloud)

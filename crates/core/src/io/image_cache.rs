@@ -22,7 +22,10 @@ pub struct ImageCache {
 #[derive(Debug)]
 struct State {
     slots: Vec<Option<Slot>>,
+    /// Bytes of pixels held here.
     num_bytes: usize,
+    /// Bytes of the budget that others use.
+    num_reserved: usize,
     clock: u64,
 }
 
@@ -37,7 +40,7 @@ impl ImageCache {
     /// with a budget of 0 every access decodes.
     pub fn new(views: Vec<View>, byte_budget: usize) -> Self {
         let slots = views.iter().map(|_| None).collect();
-        Self { views, byte_budget, state: Mutex::new(State { slots, num_bytes: 0, clock: 0 }) }
+        Self { views, byte_budget, state: Mutex::new(State { slots, num_bytes: 0, num_reserved: 0, clock: 0 }) }
     }
 
     /// The views, in the order of their indices.
@@ -55,9 +58,10 @@ impl ImageCache {
         self.views.is_empty()
     }
 
-    /// Bytes of pixels held now.
+    /// Bytes of pixels held now, with those reserved for reduced photographs.
     pub fn num_bytes(&self) -> usize {
-        self.lock().num_bytes
+        let state = self.lock();
+        state.num_bytes + state.num_reserved
     }
 
     /// The image of view `index`, decoded now if it is not held.
@@ -73,6 +77,35 @@ impl ImageCache {
         }
         let image = Arc::new(load_view_image(view)?);
         Ok(self.lock().insert(index, image, self.byte_budget))
+    }
+
+    /// The image of view `index`, not kept if it is not held.
+    ///
+    /// # Errors
+    /// As [`ImageCache::get`].
+    pub(super) fn get_unkept(&self, index: usize) -> Result<Arc<TrainingImage>> {
+        let held = self.views.get(index).and_then(|_| self.lock().touch(index));
+        match (held, self.views.get(index)) {
+            (Some(image), _) => Ok(image),
+            (None, Some(view)) => load_view_image(view).map(Arc::new),
+            (None, None) => self.get(index),
+        }
+    }
+
+    /// Makes room for `num_bytes` that are held elsewhere, and says whether the budget has as many.
+    pub(super) fn reserve(&self, num_bytes: usize) -> bool {
+        let mut state = self.lock();
+        let fits = state.num_reserved + num_bytes <= self.byte_budget;
+        if fits {
+            state.num_reserved += num_bytes;
+            state.shrink(self.byte_budget);
+        }
+        fits
+    }
+
+    /// Gives back what was reserved.
+    pub(super) fn release(&self, num_bytes: usize) {
+        self.lock().num_reserved -= num_bytes;
     }
 
     /// Decodes images in parallel, in the order of the views, until all are held or the budget is full; returns how many
@@ -139,22 +172,27 @@ impl State {
             return held;
         }
         let needed = image.num_bytes();
-        if needed <= budget {
-            while self.num_bytes + needed > budget {
-                let oldest = (0..self.slots.len())
-                    .filter_map(|i| self.slots[i].as_ref().map(|slot| (slot.last_use, i)))
-                    .min()
-                    .expect("bytes are held, so that a slot is filled");
-                self.evict(oldest.1);
-            }
+        if needed + self.num_reserved <= budget {
+            self.shrink(budget - needed);
             self.insert_if_room(index, Arc::clone(&image), budget);
         }
         image
     }
 
+    /// Drops the least recently used until what is held and reserved fits `budget`.
+    fn shrink(&mut self, budget: usize) {
+        while self.num_bytes > 0 && self.num_bytes + self.num_reserved > budget {
+            let oldest = (0..self.slots.len())
+                .filter_map(|i| self.slots[i].as_ref().map(|slot| (slot.last_use, i)))
+                .min()
+                .expect("bytes are held, so that a slot is filled");
+            self.evict(oldest.1);
+        }
+    }
+
     fn insert_if_room(&mut self, index: usize, image: Arc<TrainingImage>, budget: usize) {
         let needed = image.num_bytes();
-        if self.slots[index].is_none() && self.num_bytes + needed <= budget {
+        if self.slots[index].is_none() && self.num_bytes + self.num_reserved + needed <= budget {
             self.clock += 1;
             self.num_bytes += needed;
             self.slots[index] = Some(Slot { image, last_use: self.clock });

@@ -49,7 +49,7 @@ impl TrainingImage {
     }
 
     /// Exact-area resampling of all parts; unchanged at the same size.
-    fn resized(self, width: u32, height: u32) -> Self {
+    pub(super) fn resized(self, width: u32, height: u32) -> Self {
         let (from, to) = ([self.image.width, self.image.height], [width, height]);
         if from == to {
             return self;

@@ -16,6 +16,7 @@ pub mod model;
 pub mod ply;
 pub mod poses;
 mod quantize;
+pub mod reduced_images;
 pub mod splat;
 pub mod spz;
 pub mod transforms;

@@ -1,12 +1,19 @@
 //! Training on the CPU backends: tensors to vectors, vectors through the kernels, vectors to tensors; all without a copy
 //! as long as nothing else shares the tensors.
 
-use super::{AdamUpdate, Changed, NoiseUpdate, OptimOps, Refinement, State, Status};
+use super::{AdamUpdate, Changed, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State, Status};
 use crate::event::DensifyReport;
 use crate::kernels::cpu::{
-    adam, noise::add_noise, regularize::regularize, relocate::refine, rows::Rows, scale_decay::add_scale_decay,
+    adam,
+    noise::add_noise,
+    regularize::regularize,
+    relocate::refine,
+    rows::Rows,
+    scale_decay::add_scale_decay,
+    seen::{self, Missing},
 };
-use crate::optim::Columns;
+use crate::optim::missed::missed;
+use crate::optim::{Columns, Group, LearningRates, SeenBy};
 use burn::backend::{
     NdArray,
     tensor::{FloatTensor, IntTensor},
@@ -52,7 +59,7 @@ fn with_rows<B: HostTensors>(
         let num_gaussians = shape_of::<B>(&state.params.opacity_logits)[0];
         return Changed { state, outcome: Ok(DensifyReport { num_gaussians, ..DensifyReport::default() }) };
     }
-    let State { params, first, second, status: words } = state;
+    let State { params, first, second, status: words, last } = state;
     let mut rows = Rows { params: columns::<B>(params), first: columns::<B>(first), second: columns::<B>(second) };
     let before = status;
     let outcome = change(&mut rows, &mut status);
@@ -61,6 +68,7 @@ fn with_rows<B: HostTensors>(
         first: parameters::<B>(rows.first),
         second: parameters::<B>(rows.second),
         status: if status == before { words } else { status_tensor::<B>(status) },
+        last,
     };
     Changed { state, outcome: Ok(outcome) }
 }
@@ -76,13 +84,78 @@ fn host_adam<B: HostTensors>(
     if status.failed.is_none() && !loss.is_finite() {
         state.status = status_tensor::<B>(Status { failed: Some((update.number, loss)), ..status });
     }
-    with_rows::<B>(state, |rows, status| {
+    let mut words = if update.marked_only { words::<B>(&state.last) } else { Vec::new() };
+    let mut changed = with_rows::<B>(state, |rows, status| {
         let mut gradients = columns::<B>(gradients);
         gradients.widths = rows.params.widths;
         [status.mean_opacity, status.mean_scale] = regularize(&rows.params, &mut gradients, update.regularizers);
-        adam::update_all(rows, &gradients, &update.rates, &adam::Step::new(&update.settings, update.number));
+        let step = adam::Step::new(&update.settings, update.number);
+        if update.marked_only {
+            let sh = std::mem::take(gradients.of_mut(Group::Sh));
+            let lanes = update.rates.lanes(Group::Sh, rows.params.widths[Group::Sh as usize]);
+            let table = missed(&update.settings, update.number - 1);
+            let missing = Missing { table: &table, through: update.number - 1, lanes: &lanes };
+            seen::update_seen(rows, &sh, &mut words, &missing, &step);
+        }
+        adam::update_all(rows, &gradients, &update.rates, &step);
+        DensifyReport { num_gaussians: rows.num_rows(), ..DensifyReport::default() }
+    });
+    if update.marked_only {
+        changed.state.last = words_tensor::<B>(words);
+    }
+    changed
+}
+
+/// Words of rows that lag.
+fn words<B: HostTensors>(last: &IntTensor<B>) -> Vec<u32> {
+    bytemuck::cast_slice(&B::i32_slice(last)).to_vec()
+}
+
+fn words_tensor<B: HostTensors>(words: Vec<u32>) -> IntTensor<B> {
+    let len = words.len();
+    B::i32_tensor(bytemuck::cast_vec(words), &[len])
+}
+
+/// Learning rates of the SH coefficients of a row of `width` values.
+fn lanes(missed: &MissedUpdates, width: usize) -> Vec<f32> {
+    LearningRates { sh_dc: missed.rates.dc, sh_rest: missed.rates.rest, ..LearningRates::NONE }.lanes(Group::Sh, width)
+}
+
+fn host_prepare<B: HostTensors>(state: State<B>, view: &SeenBy, missed_updates: &MissedUpdates) -> Changed<B> {
+    let mut words = words::<B>(&state.last);
+    let mut changed = with_rows::<B>(state, |rows, _| {
+        let lanes = lanes(missed_updates, rows.params.widths[Group::Sh as usize]);
+        let table = missed(&missed_updates.settings, missed_updates.through);
+        let missing = Missing { table: &table, through: missed_updates.through, lanes: &lanes };
+        seen::prepare(&mut rows.params, &rows.first, &rows.second, &mut words, view, &missing);
+        DensifyReport { num_gaussians: rows.num_rows(), ..DensifyReport::default() }
+    });
+    changed.state.last = words_tensor::<B>(words);
+    changed
+}
+
+fn host_catch_up<B: HostTensors>(state: State<B>, missed_updates: &MissedUpdates) -> Changed<B> {
+    let words = words::<B>(&state.last);
+    with_rows::<B>(state, |rows, _| {
+        let lanes = lanes(missed_updates, rows.params.widths[Group::Sh as usize]);
+        let table = missed(&missed_updates.settings, missed_updates.through);
+        seen::catch_up(rows, &words, &Missing { table: &table, through: missed_updates.through, lanes: &lanes });
         DensifyReport { num_gaussians: rows.num_rows(), ..DensifyReport::default() }
     })
+}
+
+fn host_advanced<B: HostTensors>(mut state: State<B>, missed_updates: &MissedUpdates) -> Changed<B> {
+    let words = words::<B>(&state.last);
+    if status_of::<B>(&state.status).failed.is_none() {
+        let shape = shape_of::<B>(&state.params.sh);
+        let lanes = lanes(missed_updates, shape[1] * shape[2]);
+        let table = missed(&missed_updates.settings, missed_updates.through);
+        let missing = Missing { table: &table, through: missed_updates.through, lanes: &lanes };
+        let mut values = B::f32_slice(&state.params.sh).into_owned();
+        seen::advance(&mut values, &B::f32_slice(&state.first.sh), &B::f32_slice(&state.second.sh), &words, &missing);
+        state.params.sh = B::f32_tensor(values, &shape);
+    }
+    Changed { state, outcome: Ok(DensifyReport { num_gaussians: words.len(), ..DensifyReport::default() }) }
 }
 
 /// Runs `change`, which moves no row onto another and adds none.
@@ -116,6 +189,18 @@ macro_rules! host_optim_ops {
                 _shared: bool,
             ) -> Changed<Self> {
                 host_adam(state, gradients, &loss, &update)
+            }
+
+            fn prepare_seen(state: State<Self>, view: SeenBy, missed: MissedUpdates, _shared: bool) -> Changed<Self> {
+                host_prepare(state, &view, &missed)
+            }
+
+            fn catch_up(state: State<Self>, missed: MissedUpdates, _shared: bool) -> Changed<Self> {
+                host_catch_up(state, &missed)
+            }
+
+            fn advanced(state: State<Self>, missed: MissedUpdates) -> Changed<Self> {
+                host_advanced(state, &missed)
             }
 
             fn add_noise(state: State<Self>, noise: NoiseUpdate, _shared: bool) -> Changed<Self> {

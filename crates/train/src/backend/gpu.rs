@@ -4,14 +4,16 @@
 //! overwritten in place. Moments belong to the state alone; parameters do unless the caller says `shared`, which costs a
 //! copy: the reference count of an allocation with five views of it cannot tell.
 
-use super::{AdamUpdate, Changed, NoiseUpdate, OptimOps, Refinement, State};
+use super::{AdamUpdate, Changed, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State};
 use crate::event::DensifyReport;
 use crate::kernels::gpu::adam::{self, Packed};
 use crate::kernels::gpu::noise::add_noise;
 use crate::kernels::gpu::regularize::regularize;
 use crate::kernels::gpu::relocate::{PackedRows, refine};
-use crate::kernels::gpu::rows::{Listed, clamp_opacities, copied, morton_order, select_rows};
+use crate::kernels::gpu::rows::{Listed, clamp_opacities, copied, copied_words, morton_order, select_rows};
 use crate::kernels::gpu::scale_decay::add_scale_decay;
+use crate::kernels::gpu::seen;
+use crate::optim::SeenBy;
 use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn_cubecl::{CubeBackend, tensor::CubeTensor};
 use gazesplat_render::Result;
@@ -45,7 +47,10 @@ fn changed(
     match pack(&gpu, &state, shared).and_then(|rows| change(&gpu, rows, &state)) {
         Ok((PackedRows { layout, params, first, second }, report)) => {
             let [params, first, second] = [params, first, second].map(|whole| layout.views(&whole));
-            Changed { state: State { params, first, second, status: state.status }, outcome: Ok(report) }
+            Changed {
+                state: State { params, first, second, status: state.status, last: state.last },
+                outcome: Ok(report),
+            }
         }
         Err(error) => Changed { state, outcome: Err(error) },
     }
@@ -85,6 +90,30 @@ impl OptimOps for CubeBackend {
             let PackedRows { layout, params, first, second } = &rows;
             let packed = Packed { params, grads: &grads, first, second };
             adam::update_all(gpu, layout, &packed, &state.status, &update);
+            if update.marked_only {
+                seen::update_seen(gpu, &rows, &grads, &state.last, &state.status, &update);
+            }
+            Ok(unmoved(rows))
+        })
+    }
+
+    fn prepare_seen(state: GpuState, view: SeenBy, missed: MissedUpdates, shared: bool) -> Changed<Self> {
+        changed(state, shared, |gpu, rows, state| {
+            seen::prepare(gpu, &rows, &state.last, &state.status, &view, missed)?;
+            Ok(unmoved(rows))
+        })
+    }
+
+    fn catch_up(state: GpuState, missed: MissedUpdates, shared: bool) -> Changed<Self> {
+        changed(state, shared, |gpu, rows, state| {
+            seen::catch_up(gpu, &rows, &state.last, &state.status, missed)?;
+            Ok(unmoved(rows))
+        })
+    }
+
+    fn advanced(state: GpuState, missed: MissedUpdates) -> Changed<Self> {
+        changed(state, true, |gpu, rows, state| {
+            seen::advance(gpu, &rows, &state.last, &state.status, missed)?;
             Ok(unmoved(rows))
         })
     }
@@ -123,11 +152,17 @@ impl OptimOps for CubeBackend {
     }
 
     fn copied(state: GpuState) -> Changed<Self> {
-        changed(state, true, |gpu, mut rows, _| {
+        let mut copy = changed(state, true, |gpu, mut rows, _| {
             rows.first = copied(gpu, rows.first, rows.layout.len())?;
             rows.second = copied(gpu, rows.second, rows.layout.len())?;
             Ok(unmoved(rows))
-        })
+        });
+        let len = copy.state.last.meta.num_elements();
+        match copied_words(&Gpu::of(&copy.state.status), &copy.state.last, len) {
+            Ok(last) => copy.state.last = last,
+            Err(error) => copy.outcome = Err(error),
+        }
+        copy
     }
 
     fn add_scale_decay(
@@ -170,7 +205,8 @@ mod tests {
             layout.views(&whole)
         };
         let status = gpu.upload_u32(&Status::default().to_words(), &[Status::NUM_WORDS]);
-        let state = State { params: zeros(), first: zeros(), second: zeros(), status };
+        let last = gpu.upload_u32(&[0], &[1]);
+        let state = State { params: zeros(), first: zeros(), second: zeros(), status, last };
         let is_same =
             |a: &GpuParameters, b: &GpuParameters| a.sh.handle.memory.descriptor() == b.sh.handle.memory.descriptor();
         let update = AdamUpdate {
@@ -179,6 +215,7 @@ mod tests {
             rates: LearningRates::at(&OptimSection::default(), 0, 10, 1.0),
             regularizers: Regularizers::default(),
             report: false,
+            marked_only: false,
         };
         for shared in [false, true] {
             let loss = gpu.zeros("bytes of a test", &[1], DType::F32).expect("it fits");

@@ -12,7 +12,7 @@ mod cpu;
 mod gpu;
 
 use crate::event::DensifyReport;
-use crate::optim::{AdamSettings, LearningRates, Regularizers};
+use crate::optim::{AdamSettings, LearningRates, Regularizers, SeenBy, ShRates};
 use burn::backend::{
     Backend, ExtensionType, backend_extension,
     tensor::{FloatTensor, IntTensor},
@@ -34,6 +34,10 @@ pub struct State<B: Backend> {
     pub second: Parameters<B>,
     /// [`Status`], `[4]` words. Overwritten in place on a GPU: never handed out.
     pub status: IntTensor<B>,
+    /// Where rows lag: the last update that the SH moments of each row have seen, `[N]`, with
+    /// [`crate::optim::missed::PREPARED`] while an update is under way; else one unused word. Overwritten in place on a GPU: never
+    /// handed out.
+    pub last: IntTensor<B>,
 }
 
 /// A state after an operation.
@@ -90,6 +94,19 @@ pub struct AdamUpdate {
     pub regularizers: Regularizers,
     /// Put the means that the regularisers weigh into the status; a CPU does it anyway.
     pub report: bool,
+    /// Change the SH coefficients of the rows that [`OptimOps::prepare_seen`] marked only.
+    pub marked_only: bool,
+}
+
+/// What rows that lag are brought up to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MissedUpdates {
+    /// Number of the last update that they are to have seen.
+    pub through: u32,
+    /// Constants.
+    pub settings: AdamSettings,
+    /// Learning rates of what lags.
+    pub rates: ShRates,
 }
 
 /// One addition of position noise (MCMC, Eq. 8).
@@ -147,6 +164,21 @@ pub trait OptimOps: Backend {
         update: AdamUpdate,
         shared: bool,
     ) -> Changed<Self>;
+
+    /// Marks the rows that `view` may see and brings their SH coefficients up to date, not their moments. Rows lag: the state
+    /// has a word for each.
+    fn prepare_seen(
+        #[extension_type] state: State<Self>,
+        view: SeenBy,
+        missed: MissedUpdates,
+        shared: bool,
+    ) -> Changed<Self>;
+
+    /// Brings SH coefficients and moments of all rows up to date; their words mean nothing afterwards. Rows lag.
+    fn catch_up(#[extension_type] state: State<Self>, missed: MissedUpdates, shared: bool) -> Changed<Self>;
+
+    /// The state with its SH coefficients brought up to date on a copy, everything else as it is. Rows lag.
+    fn advanced(#[extension_type] state: State<Self>, missed: MissedUpdates) -> Changed<Self>;
 
     /// Adds position noise to the means.
     fn add_noise(#[extension_type] state: State<Self>, noise: NoiseUpdate, shared: bool) -> Changed<Self>;

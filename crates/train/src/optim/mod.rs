@@ -1,11 +1,13 @@
 //! The optimiser: a model in training, its parameters as rows on the host, learning-rate schedules.
 
 pub mod adam;
+pub mod missed;
 pub mod schedule;
 pub mod state;
 
 pub use adam::{AdamSettings, Regularizers};
 pub use schedule::LearningRates;
+pub use state::lag::{SeenBy, ShRates};
 pub use state::{HostState, ModelState, Snapshot};
 
 use crate::error::Result;

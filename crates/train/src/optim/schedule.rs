@@ -27,6 +27,10 @@ pub struct LearningRates {
 }
 
 impl LearningRates {
+    /// Rates of 0.
+    pub const NONE: Self =
+        Self { means: 0.0, quats: 0.0, log_scales: 0.0, opacity_logits: 0.0, sh_dc: 0.0, sh_rest: 0.0 };
+
     /// Rates at `step` (counted from 0) of `num_steps`, in a scene of radius `extent` world units.
     pub fn at(section: &OptimSection, step: u32, num_steps: u32, extent: f32) -> Self {
         let progress = step as f32 / num_steps.saturating_sub(1).max(1) as f32;
@@ -59,6 +63,17 @@ pub fn sh_degree(step: u32, num_steps: u32, every: u32, max_degree: u32) -> u32 
     ((f64::from(step) / interval) as u32).min(max_degree)
 }
 
+/// How often the sides of the images of `step` of `num_steps`, counted from 0, are halved: `num_downscales` times at first,
+/// once less every `every` steps of a run of 30,000; the last step has full size in any run.
+pub fn num_halvings(step: u32, num_steps: u32, num_downscales: u32, every: u32) -> u32 {
+    if step + 1 >= num_steps {
+        return 0;
+    }
+    // In whole numbers: where a size begins depends on no rounding.
+    let passed = u64::from(step) * 30_000 / (u64::from(every.max(1)) * u64::from(num_steps));
+    u64::from(num_downscales).saturating_sub(passed) as u32
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -79,6 +94,21 @@ mod tests {
         let lanes = rates.lanes(Group::Sh, 12);
         assert_eq!(lanes[..3], [2.5e-3; 3]);
         assert!(lanes[3..].iter().all(|&lr| (lr - 1.25e-4).abs() < 1e-10));
+    }
+
+    #[test]
+    fn images_grow_to_full_size_at_the_same_share_of_every_run() {
+        let at = |step, steps| num_halvings(step, steps, 2, 3000);
+        let steps = [0, 2999, 3000, 5999, 6000, 29_999];
+        assert_eq!(steps.map(|step| at(step, 30_000)), [2, 2, 1, 1, 0, 0]);
+        assert_eq!([0, 29, 30, 59, 60, 299].map(|step| at(step, 300)), [2, 2, 1, 1, 0, 0]);
+        // However short a run is and however late the schedule: its last step has full size.
+        for num_steps in 1..50 {
+            assert_eq!(num_halvings(num_steps - 1, num_steps, 8, 3700), 0);
+            let levels: Vec<u32> = (0..num_steps).map(|step| num_halvings(step, num_steps, 8, 3700)).collect();
+            assert!(levels.is_sorted_by(|a, b| a >= b), "{levels:?}");
+        }
+        assert!((0..100).all(|step| num_halvings(step, 100, 0, 3000) == 0));
     }
 
     #[test]

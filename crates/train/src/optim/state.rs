@@ -1,7 +1,7 @@
 //! A model in training: parameters and moments as tensors on one device, and how many updates they have seen.
 
-use super::{AdamSettings, Columns, LearningRates, Regularizers};
-use crate::backend::{AdamUpdate, Changed, NoiseUpdate, OptimOps, Refinement, State, Status};
+use super::{AdamSettings, Columns, LearningRates, Regularizers, ShRates};
+use crate::backend::{AdamUpdate, Changed, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State, Status};
 use crate::error::Result;
 use crate::event::DensifyReport;
 use crate::kernels::cpu::rows::Rows;
@@ -13,11 +13,18 @@ use gazesplat_render::backend::Parameters;
 use gazesplat_render::gpu::packed::PackedLayout;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+pub(crate) mod lag;
+
+use lag::{placeholder, words_tensor};
+
 /// A model with its optimiser as it was at some moment.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
     tensors: State<Dispatch>,
     num_updates: u32,
+    /// What rows that lag are brought up to before anybody sees them.
+    missed: MissedUpdates,
+    is_lagging: bool,
 }
 
 impl Snapshot {
@@ -26,19 +33,16 @@ impl Snapshot {
         Tensor::<1>::from_dispatch(self.tensors.params.opacity_logits.clone()).dims()[0]
     }
 
-    /// The parameters, for a caller that changes nothing.
-    pub fn splats(&self) -> Splats {
-        splats(self.tensors.params.clone())
-    }
-
     /// Reads everything back.
     ///
     /// # Errors
     /// [`crate::Error::Render`] when the device does not answer.
     pub fn to_host(&self) -> Result<HostState> {
-        let State { params, first, second, .. } = &self.tensors;
+        let State { params, first, second, last, .. } = &self.tensors;
+        let last = if self.is_lagging { lag::words_of(last.clone())? } else { Vec::new() };
         let [params, first, second] = [params, first, second].map(|p| Columns::from_splats(splats(p.clone())));
-        Ok(HostState { rows: Rows { params: params?, first: first?, second: second? }, num_updates: self.num_updates })
+        let rows = Rows { params: params?, first: first?, second: second? };
+        Ok(HostState { rows, num_updates: self.num_updates, last })
     }
 
     /// Uploads `state`.
@@ -46,11 +50,14 @@ impl Snapshot {
     /// # Errors
     /// As [`ModelState::new`].
     pub fn from_host(state: HostState, device: &Device) -> Result<Self> {
-        let HostState { rows: Rows { params, first, second }, num_updates } = state;
+        let HostState { rows: Rows { params, first, second }, num_updates, last } = state;
         check_size(&params, device)?;
         let [params, first, second] = [params, first, second].map(|columns| dispatched(columns.into_splats(device)));
         let status = status_tensor(Status::default(), device);
-        Ok(Self { tensors: State { params, first, second, status }, num_updates })
+        let is_lagging = !last.is_empty();
+        let last = if is_lagging { words_tensor(last, device) } else { placeholder(device) };
+        let missed = MissedUpdates { through: num_updates, settings: AdamSettings::default(), rates: ShRates::NONE };
+        Ok(Self { tensors: State { params, first, second, status, last }, num_updates, missed, is_lagging })
     }
 }
 
@@ -61,6 +68,8 @@ pub struct HostState {
     pub rows: Rows,
     /// Updates done.
     pub num_updates: u32,
+    /// The last update that the SH moments of each row have seen, where rows lag; else empty.
+    pub last: Vec<u32>,
 }
 
 /// Refuses what a GPU takes in no single buffer.
@@ -93,6 +102,12 @@ pub struct ModelState {
     num_updates: u32,
     is_handed_out: AtomicBool,
     device: Device,
+    /// Rates of what may lag; `None` = nothing may.
+    lag: Option<ShRates>,
+    /// Whether rows lag: the state then has their words.
+    is_lagging: bool,
+    /// Whether what the next update will see has been brought up to date.
+    is_prepared: bool,
 }
 
 impl ModelState {
@@ -107,6 +122,7 @@ impl ModelState {
             first: zeros(),
             second: zeros(),
             status: status_tensor(Status::default(), device),
+            last: placeholder(device),
             params: dispatched(params.into_splats(device)),
         };
         Ok(Self {
@@ -115,6 +131,9 @@ impl ModelState {
             num_updates: 0,
             is_handed_out: AtomicBool::new(false),
             device: device.clone(),
+            lag: None,
+            is_lagging: false,
+            is_prepared: false,
         })
     }
 
@@ -123,13 +142,25 @@ impl ModelState {
     /// # Errors
     /// As [`ModelState::new`].
     pub(crate) fn from_host(state: HostState, settings: AdamSettings, device: &Device) -> Result<Self> {
-        let Snapshot { tensors, num_updates } = Snapshot::from_host(state, device)?;
-        let is_handed_out = AtomicBool::new(false);
-        Ok(Self { tensors: Some(tensors), settings, num_updates, is_handed_out, device: device.clone() })
+        let Snapshot { tensors, num_updates, is_lagging, .. } = Snapshot::from_host(state, device)?;
+        Ok(Self {
+            tensors: Some(tensors),
+            settings,
+            num_updates,
+            is_handed_out: AtomicBool::new(false),
+            device: device.clone(),
+            lag: None,
+            is_lagging,
+            is_prepared: false,
+        })
     }
 
     fn tensors(&self) -> &State<Dispatch> {
         self.tensors.as_ref().expect("only an operation in progress takes the tensors")
+    }
+
+    fn tensors_mut(&mut self) -> &mut State<Dispatch> {
+        self.tensors.as_mut().expect("only an operation in progress takes the tensors")
     }
 
     /// Number of rows N.
@@ -152,7 +183,8 @@ impl ModelState {
         &self.device
     }
 
-    /// The parameters, to keep: later operations leave these tensors as they are.
+    /// The parameters, to keep: later operations leave these tensors as they are. Rows that lag do so here;
+    /// [`ModelState::current`] brings them up to date.
     pub fn splats(&self) -> Splats {
         self.is_handed_out.store(true, Ordering::Relaxed);
         self.lent()
@@ -217,8 +249,12 @@ impl ModelState {
         regularizers: Regularizers,
         report: bool,
     ) -> Result<()> {
+        let marked_only = std::mem::take(&mut self.is_prepared);
+        if !marked_only {
+            self.catch_up()?;
+        }
         let number = self.num_updates + 1;
-        let update = AdamUpdate { number, settings: self.settings, rates, regularizers, report };
+        let update = AdamUpdate { number, settings: self.settings, rates, regularizers, report, marked_only };
         let (gradients, loss) = (dispatched(gradients), loss.into_dispatch());
         self.apply(|state, shared| <Dispatch as OptimOps>::adam(state, gradients, loss, update, shared))?;
         self.num_updates = number;
@@ -241,6 +277,7 @@ impl ModelState {
     /// # Errors
     /// As [`ModelState::update`], or when the device does not answer.
     pub fn refine(&mut self, refinement: Refinement) -> Result<DensifyReport> {
+        self.catch_up()?;
         self.apply(|state, shared| <Dispatch as OptimOps>::refine(state, refinement, shared))
     }
 
@@ -249,6 +286,7 @@ impl ModelState {
     /// # Errors
     /// As [`ModelState::update`].
     pub fn sort_spatially(&mut self, center: [f32; 3], half: f32) -> Result<()> {
+        self.catch_up()?;
         self.apply(|state, _| <Dispatch as OptimOps>::sort_spatially(state, center, half)).map(drop)
     }
 
@@ -262,6 +300,7 @@ impl ModelState {
     pub fn select_rows(&mut self, rows: Vec<u32>) -> Result<()> {
         let num_rows = self.num_rows();
         assert!(rows.iter().all(|&row| (row as usize) < num_rows), "rows of {num_rows} are selected");
+        self.catch_up()?;
         self.apply(|state, _| <Dispatch as OptimOps>::select_rows(state, rows)).map(drop)
     }
 
@@ -279,7 +318,13 @@ impl ModelState {
     /// # Errors
     /// As [`ModelState::update`].
     pub fn snapshot(&self) -> Result<Snapshot> {
-        Ok(Snapshot { tensors: copied(self.tensors().clone())?, num_updates: self.num_updates })
+        let (num_updates, is_lagging) = (self.num_updates, self.is_lagging);
+        Ok(Snapshot {
+            tensors: copied(self.tensors().clone())?,
+            num_updates,
+            missed: self.missed_updates(),
+            is_lagging,
+        })
     }
 
     /// Goes back to `snapshot`, which stays as it is; a closed state is open again.
@@ -291,6 +336,7 @@ impl ModelState {
         tensors.status = status_tensor(Status::default(), &self.device);
         self.tensors = Some(tensors);
         self.num_updates = snapshot.num_updates;
+        (self.is_lagging, self.is_prepared) = (snapshot.is_lagging, false);
         *self.is_handed_out.get_mut() = false;
         Ok(())
     }
@@ -303,6 +349,7 @@ impl ModelState {
     /// # Panics
     /// If the rows already have more.
     pub fn widen_sh(&mut self, num_coefficients: usize) -> Result<()> {
+        self.catch_up()?;
         self.apply(|state, _| <Dispatch as OptimOps>::widen_sh(state, num_coefficients)).map(drop)
     }
 }
@@ -311,12 +358,12 @@ impl ModelState {
 impl ModelState {
     /// Where the values of parameters and moments lie in the memory of a CPU.
     pub(crate) fn addresses(&mut self) -> [[usize; 5]; 3] {
-        let State { params, first, second, status } = self.tensors.take().expect("the test sets this up");
+        let State { params, first, second, status, last } = self.tensors.take().expect("the test sets this up");
         let mut columns = [params, first, second].map(|p| Columns::from_splats(splats(p)).expect("a CPU answers"));
         let found = columns.each_ref().map(|c| c.data.each_ref().map(|d| d.as_ptr() as usize));
         let [params, first, second] =
             columns.each_mut().map(|c| dispatched(std::mem::take(c).into_splats(&self.device)));
-        self.tensors = Some(State { params, first, second, status });
+        self.tensors = Some(State { params, first, second, status, last });
         found
     }
 }

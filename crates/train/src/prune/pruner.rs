@@ -281,7 +281,7 @@ impl Pruner {
     /// When the device does not answer.
     pub fn result(&self) -> Result<GaussianCloud> {
         match &self.best {
-            Some((snapshot, _)) => self.trainer.exported(&snapshot.splats()),
+            Some((snapshot, _)) => self.trainer.exported(&snapshot.splats()?),
             None => self.trainer.to_cloud(),
         }
     }

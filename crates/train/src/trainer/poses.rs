@@ -39,9 +39,9 @@ impl Poses {
 }
 
 impl Trainer {
-    /// The camera by which the next step sees `view`, and the probe that its gradient asks, once poses move.
-    pub(super) fn camera_of(&mut self, view: usize) -> Result<(Camera, Option<PoseProbe>)> {
-        let given = self.images.views()[view].camera;
+    /// The camera by which the next step sees `view`, `given` being the one of its photograph, and the probe that its
+    /// gradient asks, once poses move.
+    pub(super) fn camera_of(&mut self, view: usize, given: Camera) -> Result<(Camera, Option<PoseProbe>)> {
         if self.poses.is_none() {
             return Ok((given, None));
         }

@@ -257,6 +257,52 @@ mod tests {
         assert!(!trainer.restore_poses(Some(vec![ViewPose::default(); 6])) && trainer.restore_poses(None));
     }
 
+    /// Images grow at steps 80 and 160; rows lag from 512 on, and after the last refinement, at 667, for long.
+    #[test]
+    fn interrupted_runs_from_coarse_to_fine_with_rows_that_lag_end_in_the_same_bytes() {
+        const STEPS: u32 = 800;
+        let (dir, dataset) = scene(7);
+        let (mut config, device) = (config(), cpu_device());
+        config.train.steps = STEPS;
+        (config.train.num_downscales, config.optim.visible_only) = (2, true);
+        let path = dir.path().join("checkpoint");
+        let run = |trainer: &mut Trainer, to: u32| {
+            while trainer.step < to {
+                trainer.step().expect("trains");
+            }
+            trainer.state.snapshot().and_then(|s| s.to_host()).expect("readable")
+        };
+        let fresh = || Trainer::new(&dataset, images(&dataset), &config, &device).expect("valid");
+        let expected = run(&mut fresh(), STEPS);
+        assert!(expected.last.iter().any(|&word| word + 5 < STEPS), "some rows are behind at the end");
+        let mut trainer = fresh();
+        for stop in [79, 80, 81, 159, 160, 161, 511, 512, 513, 640, 668, 767, 768, 769, 790] {
+            run(&mut trainer, stop);
+            // Whoever looks changes nothing.
+            trainer.to_cloud().expect("readable");
+            trainer.evaluate().expect("readable");
+            trainer.save(&path, &"noted").expect("writable");
+            trainer = resumed_plainly(&dataset, &config, &device, &path);
+        }
+        assert!(run(&mut trainer, STEPS) == expected);
+        // A checkpoint whose words fit no model is damaged, not a panic.
+        trainer.save(&path, &"noted").expect("writable");
+        let mut state = expected;
+        for last in [vec![STEPS; 3], vec![STEPS + 1; state.rows.num_rows()], vec![3; state.rows.num_rows()]] {
+            state.last = last;
+            let meta = serde_json::json!(null);
+            checkpoint::save(&path, KIND, &meta, &[("state", &state)]).expect("writable");
+            let loaded = checkpoint::load::<serde_json::Value>(&path, KIND, &["state"]);
+            let said = loaded.expect_err("refused").to_string();
+            assert!(said.contains("damaged: `state.last` does not fit"), "{said}");
+        }
+    }
+
+    fn resumed_plainly(dataset: &Dataset, config: &Config, device: &Device, path: &Path) -> Trainer {
+        let resumed: Result<(Trainer, String)> = Trainer::resume(dataset, images(dataset), config, device, path);
+        resumed.expect("valid").0
+    }
+
     /// The device repeats its bits from run to run, so that the tolerance is none.
     #[test]
     fn a_gpu_goes_on_as_if_nothing_had_happened() {

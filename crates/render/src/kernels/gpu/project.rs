@@ -93,7 +93,7 @@ pub fn view_launch(view: &ViewParams) -> ViewParamsLaunch {
 }
 
 /// The sides of the frustum as a kernel argument.
-fn sides_launch(sides: &Sides) -> SidesLaunch {
+pub fn sides_launch(sides: &Sides) -> SidesLaunch {
     let side = |s: Side| SideLaunch::new(Vec3Launch::new(s.normal.x, s.normal.y, s.normal.z), s.offset, s.pad);
     SidesLaunch::new(side(sides.left), side(sides.right), side(sides.top), side(sides.bottom))
 }

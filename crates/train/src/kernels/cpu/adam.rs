@@ -108,19 +108,24 @@ fn chunk_kernel<const FMA: bool>(
     for (((p, g), m), v) in blocks {
         let values = p.iter_mut().zip(g).zip(m.iter_mut()).zip(v.iter_mut()).zip(rates);
         for ((((p, &g), m), v), &rate) in values {
-            let g = fma::<FMA>(step.weight_decay, *p, g);
-            let new_m = flushed(fma::<FMA>(step.beta1, *m, step.one_minus_beta1 * g));
-            let new_v = flushed(fma::<FMA>(step.beta2, *v, step.one_minus_beta2 * g * g));
-            *m = new_m;
-            *v = new_v;
-            let denominator = fma::<FMA>(new_v.sqrt(), step.inverse_sqrt_bias2, step.epsilon);
-            *p -= rate * new_m / denominator;
+            (*p, *m, *v) = updated::<FMA>(*p, g, (*m, *v), rate, step);
         }
     }
 }
 
+/// The value and its moments `(m, v)` after an update by the gradient `g`; `rate` has the bias correction of the first moment.
 #[inline(always)]
-fn flushed(v: f32) -> f32 {
+pub(super) fn updated<const FMA: bool>(p: f32, g: f32, (m, v): (f32, f32), rate: f32, step: &Step) -> (f32, f32, f32) {
+    let g = fma::<FMA>(step.weight_decay, p, g);
+    let m = flushed(fma::<FMA>(step.beta1, m, step.one_minus_beta1 * g));
+    let v = flushed(fma::<FMA>(step.beta2, v, step.one_minus_beta2 * g * g));
+    let denominator = fma::<FMA>(v.sqrt(), step.inverse_sqrt_bias2, step.epsilon);
+    (p - rate * m / denominator, m, v)
+}
+
+/// 0 for what arithmetic would be slow on.
+#[inline(always)]
+pub(super) fn flushed(v: f32) -> f32 {
     if v.abs() < 1e-37 { 0.0 } else { v }
 }
 

@@ -77,14 +77,16 @@ fn close_if_broken(loss: &[f32], status: &mut [u32], number: u32) {
     }
 }
 
-/// One update of all groups.
+/// One update of all groups; without the SH coefficients if the update is of marked rows only: those are
+/// [`super::seen::update_seen`]'s.
 pub fn update_all(gpu: &Gpu, layout: &PackedLayout, packed: &Packed<'_>, status: &CubeTensor, update: &AdamUpdate) {
+    let len = if update.marked_only { layout.offsets[4] } else { layout.len() };
     let step = Step::new(&update.settings, update.number);
     let (rates, weights) = (&update.rates, update.regularizers);
     let num_rows = layout.num_rows as f32;
     update_values::launch(
         &gpu.client,
-        gpu.units(layout.len()),
+        gpu.units(len),
         cube_dim(),
         packed.params.clone().into_buffer_arg(),
         packed.grads.clone().into_buffer_arg(),
@@ -111,7 +113,7 @@ pub fn update_all(gpu: &Gpu, layout: &PackedLayout, packed: &Packed<'_>, status:
             step.weight_decay,
             step.inverse_sqrt_bias2,
         ),
-        layout.len() as u32,
+        len as u32,
     );
 }
 
@@ -158,8 +160,9 @@ fn update_values(
     }
 }
 
+/// 0 for what would be a denormal number soon.
 #[cube]
-fn flushed(v: f32) -> f32 {
+pub fn flushed(v: f32) -> f32 {
     let mut kept = v;
     if f32::abs(v) < 1e-37f32 {
         kept = 0.0f32;

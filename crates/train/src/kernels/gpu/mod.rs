@@ -7,3 +7,4 @@ pub mod regularize;
 pub mod relocate;
 pub mod rows;
 pub mod scale_decay;
+pub mod seen;

@@ -167,6 +167,30 @@ fn copy_rows(
     }
 }
 
+/// A copy of `len` words.
+///
+/// # Errors
+/// As [`select_rows`].
+pub fn copied_words(gpu: &Gpu, from: &CubeTensor, len: usize) -> Result<CubeTensor> {
+    let to = gpu.empty("bytes of words of rows", &[len], from.dtype)?;
+    copy_words::launch(
+        &gpu.client,
+        gpu.units(len),
+        cube_dim(),
+        from.clone().into_buffer_arg(),
+        to.clone().into_buffer_arg(),
+        len as u32,
+    );
+    Ok(to)
+}
+
+#[cube(launch)]
+fn copy_words(from: &[u32], to: &mut [u32], len: u32) {
+    if ABSOLUTE_POS < len as usize {
+        to[ABSOLUTE_POS] = from[ABSOLUTE_POS];
+    }
+}
+
 /// A copy of a whole buffer: what is written in place must belong to nobody else.
 ///
 /// # Errors

@@ -11,11 +11,11 @@
 //! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`.
 
 use crate::backend::Status;
-use crate::config::{Background, Config, NamedBackground, StrategyKind};
-use crate::densify::{Fixed, Mcmc, StepContext, Strategy};
+use crate::config::{Background, Config, NamedBackground};
+use crate::densify::{self, Bounds, Fixed, StepContext, Strategy, Watched};
 use crate::error::{Error, Offender, Result};
 use crate::evaluate::{EvalReport, evaluate};
-use crate::event::{StageMs, StepReport};
+use crate::event::{DensifyReport, StageMs, StepReport};
 use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
 use crate::kernels::cpu::rows::Rows;
 use crate::limits::check_limits;
@@ -26,11 +26,17 @@ use burn::tensor::{Device, Gradients, Tensor};
 use gazesplat_core::dataset::Dataset;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::{Camera, GaussianCloud, sh};
-use gazesplat_render::{Pass, RenderOptions, Rendered, Splats, StatsMode, is_gpu, render};
+use gazesplat_render::{Pass, RenderOptions, Rendered, Splats, StatsMode, is_gpu};
 use std::sync::Arc;
-use std::time::Instant;
 
+mod clock;
+mod export;
 mod resume;
+mod watch;
+
+use clock::Clock;
+pub use export::Exported;
+use watch::Watch;
 
 /// γ of scale decay (RTGS Eq. 4).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,6 +54,8 @@ pub struct Trainer {
     test_images: Arc<ImageCache>,
     state: ModelState,
     strategy: Box<dyn Strategy>,
+    /// What densification did since step 0.
+    totals: DensifyReport,
     /// Gaussians at step 0, of which the schedule of growth is a function.
     num_initial: usize,
     /// Step at which the rows were last sorted.
@@ -107,10 +115,8 @@ impl Trainer {
         let extent = positive_extent(dataset.scene_extent());
         let cameras: Vec<Camera> = images.views().iter().map(|v| v.camera).collect();
         let center: [f32; 3] = camera_center(&cameras).into();
-        let strategy: Box<dyn Strategy> = match config.densify.strategy {
-            StrategyKind::Mcmc => Box::new(Mcmc::new(&config.densify, config.train.steps, num_initial, center, extent)),
-            StrategyKind::None => Box::new(Fixed),
-        };
+        let bounds = Bounds::of_scene(center, extent);
+        let strategy = densify::strategy(&config.densify, config.train.steps, num_initial, bounds, extent);
         let losses = WeightedLosses::default().with(1.0, Box::new(L1Ssim { ssim_weight: config.loss.ssim_weight }));
         Self {
             test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
@@ -118,6 +124,7 @@ impl Trainer {
             images,
             state,
             strategy,
+            totals: DensifyReport { num_gaussians: num_initial, ..DensifyReport::default() },
             num_initial,
             sorted_at: 0,
             losses,
@@ -170,7 +177,8 @@ impl Trainer {
             images: Arc::clone(&self.images),
             test_images: Arc::clone(&self.test_images),
             state: ModelState::new(rows.params, AdamSettings::default(), self.state.device())?,
-            strategy: Box::new(Fixed),
+            strategy: Box::new(Fixed::untouched()),
+            totals: DensifyReport { num_gaussians: cloud.len(), ..DensifyReport::default() },
             num_initial: cloud.len(),
             sorted_at: 0,
             losses: std::mem::take(&mut self.losses),
@@ -181,6 +189,11 @@ impl Trainer {
             view_order: None,
             messages: Vec::new(),
         })
+    }
+
+    /// This trainer, with every row left to its caller.
+    pub(crate) fn keeping_rows(self) -> Self {
+        Self { strategy: Box::new(Fixed::untouched()), ..self }
     }
 
     /// Goes on at step `step` with the model of `snapshot`.
@@ -228,22 +241,6 @@ impl Trainer {
         &self.messages
     }
 
-    /// The model as it is exported: of the degree of the settings, Gaussians with a non-finite value left out.
-    ///
-    /// # Errors
-    /// [`Error::Render`] when the device does not answer.
-    pub fn to_cloud(&self) -> Result<GaussianCloud> {
-        self.exported(&self.state.lent())
-    }
-
-    /// [`Trainer::to_cloud`] of another state of the model.
-    pub(crate) fn exported(&self, splats: &Splats) -> Result<GaussianCloud> {
-        let cloud = splats.to_cloud()?;
-        let cloud = cloud.with_sh_degree(cloud.sh_degree.max(self.config.model.sh_degree));
-        let valid: Vec<usize> = (0..cloud.len()).filter(|&i| cloud.is_row_valid(i)).collect();
-        Ok(if valid.len() == cloud.len() { cloud } else { cloud.select(&valid) })
-    }
-
     /// Quality on the test views.
     ///
     /// # Errors
@@ -272,15 +269,26 @@ impl Trainer {
         stage_ms.image = clock.lap();
 
         let stats = if self.scale_decay.is_some() { StatsMode::Tiles } else { StatsMode::None };
-        let options = RenderOptions { background, pass: Pass::Train, stats, ..self.config.render_options() };
+        let watched = self.strategy.watches(self.step + 1);
+        let options = RenderOptions {
+            background,
+            pass: Pass::Train,
+            stats,
+            absolute_gradients: watched == Some(Watched::Absolute),
+            ..self.config.render_options()
+        };
         let leaves = tracked(&self.state.lent());
-        let Rendered { image, splat_stats, .. } = render(&leaves, &self.images.views()[view].camera, &options)?;
+        let watch = watched.map(|_| Watch::new(&leaves));
+        let camera = &self.images.views()[view].camera;
+        let Rendered { image, splat_stats, visible, stats } = watch::render(&leaves, watch.as_ref(), camera, &options)?;
         stage_ms.forward = clock.lap();
 
         let pending = self.losses.evaluate(image, &target).expect("a trainer has a loss");
         stage_ms.loss = clock.lap();
 
-        let mut gradients = taken(leaves, pending.loss.backward());
+        let gradients = pending.loss.backward();
+        let observation = watch.and_then(|watch| watch.observation(&gradients, visible, &stats, camera));
+        let mut gradients = taken(leaves, gradients);
         if let Some(ScaleDecay { weight, scale_unit }) = self.scale_decay {
             let log_scales = self.state.lent().log_scales;
             let used = &splat_stats.tiles_used;
@@ -307,11 +315,17 @@ impl Trainer {
         drop(pending);
         stage_ms.optim = clock.lap();
 
+        if let Some(seen) = observation {
+            self.strategy.observe(seen);
+        }
         let context = StepContext { step: self.step, seed: self.config.train.seed, means_lr: rates.means };
         let densified = self.strategy.after_update(&mut self.state, &context)?;
         if densified.is_some() && self.step >= self.sorted_at + SORT_INTERVAL {
             self.state.sort_spatially(self.center, SORT_EXTENTS * self.extent)?;
             self.sorted_at = self.step;
+        }
+        if let Some(report) = &densified {
+            self.totals.add(report);
         }
         stage_ms.densify = clock.lap();
         stage_ms.total = clock.total();
@@ -324,6 +338,7 @@ impl Trainer {
             stage_ms,
             view: self.images.views()[view].name.clone(),
             densified,
+            totals: self.totals,
         })
     }
 
@@ -439,30 +454,6 @@ const SORT_INTERVAL: u32 = 200;
 /// Half the cube a GPU sorts in, in scene extents: its cells are then a hundredth of an extent wide, about a tile's
 /// reach, and what is farther is rarely near anything in the image.
 const SORT_EXTENTS: f32 = 4.0;
-
-/// Milliseconds since the last lap and since the start.
-struct Clock {
-    start: Instant,
-    last: Instant,
-}
-
-impl Clock {
-    fn start() -> Self {
-        let now = Instant::now();
-        Self { start: now, last: now }
-    }
-
-    fn lap(&mut self) -> f32 {
-        let now = Instant::now();
-        let ms = (now - self.last).as_secs_f32() * 1e3;
-        self.last = now;
-        ms
-    }
-
-    fn total(&self) -> f32 {
-        self.start.elapsed().as_secs_f32() * 1e3
-    }
-}
 
 #[cfg(test)]
 mod tests {

@@ -1,7 +1,8 @@
 //! A model in training: parameters and moments as tensors on one device, and how many updates they have seen.
 
 use super::{AdamSettings, Columns, LearningRates, Regularizers};
-use crate::backend::{AdamUpdate, Changed, NoiseUpdate, OptimOps, Refinement, State, Status};
+use crate::backend::{AdamUpdate, Changed, Densification, NoiseUpdate, OptimOps, Refinement, State, Status};
+use crate::densify::Bounds;
 use crate::error::Result;
 use crate::event::DensifyReport;
 use crate::kernels::cpu::rows::Rows;
@@ -242,6 +243,23 @@ impl ModelState {
     /// As [`ModelState::update`], or when the device does not answer.
     pub fn refine(&mut self, refinement: Refinement) -> Result<DensifyReport> {
         self.apply(|state, shared| <Dispatch as OptimOps>::refine(state, refinement, shared))
+    }
+
+    /// Clones, splits and removes rows by the mean of `statistic`, `[N, 2]`: sum and number of views (3DGS, Sec. 5.2).
+    ///
+    /// # Errors
+    /// As [`ModelState::refine`].
+    pub fn densify(&mut self, statistic: Tensor<2>, densification: Densification) -> Result<DensifyReport> {
+        let statistic = statistic.into_dispatch();
+        self.apply(|state, shared| <Dispatch as OptimOps>::densify(state, statistic, densification, shared))
+    }
+
+    /// Removes the rows beyond `bounds`, unless all are.
+    ///
+    /// # Errors
+    /// As [`ModelState::refine`].
+    pub fn sweep(&mut self, bounds: Bounds) -> Result<DensifyReport> {
+        self.apply(|state, shared| <Dispatch as OptimOps>::sweep(state, bounds, shared))
     }
 
     /// Orders the rows along a Morton curve through the cube of `half` world units around `center`.

@@ -1,9 +1,11 @@
 //! The kernels of training on a GPU: the mirror of [`super::cpu`] file by file.
 
 pub mod adam;
+pub mod densify;
 pub mod l1_ssim;
 pub mod noise;
 pub mod regularize;
 pub mod relocate;
 pub mod rows;
 pub mod scale_decay;
+pub mod sweep;

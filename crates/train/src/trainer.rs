@@ -4,11 +4,12 @@
 //! graph is gone updates them where they are: nothing of the model's size is copied. SH bands that are not learned yet
 //! are not stored, so that a young model is a quarter of the size of a grown one.
 //!
-//! On a GPU a step only queues work, unless scales decay: the counters that takes are read back. The host reads the loss
-//! in the steps that are reported, and before it measures or ends; a loss that is not finite stops the model on the device
-//! at once, and the run at the next such read.
+//! On a GPU a step only queues work, unless scales decay: the counters that takes are read back, and so are the counts of
+//! the steps that add, move or remove Gaussians. The host reads the loss in the steps that are reported, and before it
+//! measures or ends; a loss that is not finite stops the model on the device at once, and the run at the next such read.
 //!
-//! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`.
+//! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`, what
+//! strategies see in `watch`, what leaves in `export`.
 
 use crate::backend::Status;
 use crate::config::{Background, Config, NamedBackground};

@@ -1,6 +1,6 @@
 //! No densification: the initial Gaussians are only optimised.
 
-use super::{Bounds, StepContext, Strategy, Sweeps, Timing};
+use super::{Bounds, StepContext, Strategy, Sweeps};
 use crate::config::DensifySection;
 use crate::error::Result;
 use crate::event::DensifyReport;
@@ -13,10 +13,10 @@ pub struct Fixed {
 }
 
 impl Fixed {
-    /// Broken Gaussians go, as often as another strategy would look at them, to the end of the run.
+    /// Broken Gaussians go every `section.every` steps, to the end of the run. A GPU is waited for then, so that short runs
+    /// do not look more often.
     pub fn swept(section: &DensifySection, num_steps: u32, bounds: Bounds) -> Self {
-        let every = Timing::new(section, num_steps).every;
-        Self { sweeps: Some(Sweeps::new(every, num_steps, bounds)) }
+        Self { sweeps: Some(Sweeps::new(section.every, num_steps, bounds)) }
     }
 
     /// Every row stays: for a caller that removes rows itself.

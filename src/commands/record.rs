@@ -3,7 +3,7 @@
 use super::keeper::Follower;
 use crate::json_lines::JsonLines;
 use crate::report::StepPoint;
-use gazesplat_train::{EvalReport, Observer, StageMs, StepReport, TrainEvent};
+use gazesplat_train::{DensifyReport, EvalReport, Observer, StageMs, StepReport, TrainEvent};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -36,6 +36,8 @@ struct Record {
     terms: BTreeMap<&'static str, f32>,
     /// Gaussians after the step.
     num_gaussians: usize,
+    /// What densification did since the run began, by kind and reason.
+    densified: DensifyReport,
     /// Milliseconds of the step.
     step_ms: StepMs,
     /// Quality on the test views, in the steps after which it was measured.
@@ -165,6 +167,7 @@ impl Recorder {
             ssim: losses.get("ssim").unwrap_or(f32::NAN),
             terms: losses.terms.iter().map(|term| (term.name, term.value)).collect(),
             num_gaussians: report.num_gaussians,
+            densified: report.totals,
             step_ms,
             test: None,
             is_logged,
@@ -202,13 +205,7 @@ impl Observer for Recorder {
         match event {
             TrainEvent::Step(report) => self.step(report)?,
             TrainEvent::Evaluated { report, step } => self.evaluated(report, *step),
-            TrainEvent::Densified { step, report } => tracing::info!(
-                "step {step}: {} added, {} relocated, {} of them broken, {} Gaussians",
-                report.num_added,
-                report.num_relocated + report.num_relocated_broken,
-                report.num_relocated_broken,
-                report.num_gaussians
-            ),
+            TrainEvent::Densified { step, report } => tracing::info!("step {step}: {report}"),
             TrainEvent::Finished { .. } => self.flush()?,
             _ => {}
         }
@@ -240,6 +237,7 @@ mod tests {
             stage_ms: StageMs { forward: 0.25, total, ..StageMs::default() },
             view: "a".to_owned(),
             densified: None,
+            totals: DensifyReport::default(),
         }
     }
 

@@ -24,6 +24,7 @@ use gazesplat_core::{Dataset, GaussianCloud};
 use gazesplat_fovea::hvsq::ReferenceCache;
 use gazesplat_render::Splats;
 use gazesplat_train::checkpoint::fingerprint;
+use gazesplat_train::trainer::Exported;
 use gazesplat_train::{Config, EvalReport, Outcome, Trainer, with_threads};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -247,12 +248,20 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     durations.push(("training".to_owned(), train_secs));
     let num_steps = trainer.step_index();
     // A lost GPU takes the model with it; what a person waited for is then the last copy.
-    let latest = job.device.guard(|| Ok(trainer.to_cloud()?));
+    let latest = job.device.guard(|| Ok(trainer.export()?));
     let refined = job.device.guard(|| Ok(trainer.refined_views()?));
     // Giving back what is on a lost GPU may panic, too; there is nothing to lose by it.
     let _ = job.device.guard(|| {
         drop(trainer);
         Ok(())
+    });
+    let latest = latest.map(|Exported { cloud, left_out }| {
+        if left_out.total() > 0 {
+            let text = format!("{} broken Gaussians are left out of the model: {left_out}", left_out.total());
+            console.warn(&text);
+            warnings.push(text);
+        }
+        cloud
     });
     let (outcome, cloud) = match (ended, latest) {
         (Ok(outcome), Ok(cloud)) => (outcome, cloud),

@@ -97,6 +97,32 @@ fn killed_refinement_of_poses_ends_in_the_same_bytes() {
     assert_eq!(place.read("killed/poses.json"), place.read("whole/poses.json"));
 }
 
+/// The statistic of ADC is part of a checkpoint, and so are the counts in the report.
+#[test]
+fn killed_training_with_adc_is_gone_on_with_to_the_same_bytes() {
+    let place = Place::with_scene();
+    let more = [
+        "--set",
+        "densify.strategy=adc",
+        "--set",
+        "densify.absolute_gradients=true",
+        "--set",
+        "densify.start=17",
+        "--set",
+        "densify.reset_every=110",
+    ];
+    let with = |out: &[&'static str]| args(&[&more, out].concat());
+    place.run(&with(&["--out", "whole"])).done();
+    place.kill_when(&with(&["--out", "killed"]), || checkpoints(&place, "killed").len() == 2);
+    // Refinements are at step 17 and every fifth after it: each checkpoint is within an interval.
+    let again: Vec<&str> = [&args(&more)[..], &["--out", "killed", "--resume"]].concat();
+    place.run(&again).done();
+    assert_same_end(&place, "killed", "whole");
+    let last = metrics(&place, "whole").pop().expect("a line");
+    assert!(last["densified"]["num_added"].as_u64() > Some(0), "{last}");
+    assert!(last["densified"]["num_opacity_resets"] == 1 && last["densified"]["broken"]["far"] == 0, "{last}");
+}
+
 #[cfg(unix)]
 #[test]
 fn stopped_training_is_gone_on_with_to_the_same_bytes() {

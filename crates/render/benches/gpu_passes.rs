@@ -26,6 +26,7 @@ const OPTIONS: RasterOptions = RasterOptions {
     background: [0.0; 3],
     depth: false,
     smooth_cutoff: false,
+    absolute_gradients: true,
 };
 
 fn wait(gpu: &Gpu) {

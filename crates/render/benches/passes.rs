@@ -27,6 +27,7 @@ const OPTIONS: RasterOptions = RasterOptions {
     background: [0.0; 3],
     depth: false,
     smooth_cutoff: false,
+    absolute_gradients: true,
 };
 
 const RECORDS: BinExtras = BinExtras { records: true, color_max: true };

@@ -52,6 +52,9 @@ pub struct RenderOptions {
     pub stats: StatsMode,
     /// What the frame is for.
     pub pass: Pass,
+    /// Whether the gradient that a [`crate::MeansProbe`] receives has the sums of per-pixel magnitudes (Ye 2024); else
+    /// those are zero and cost nothing. Without a probe it says nothing.
+    pub absolute_gradients: bool,
 }
 
 impl Default for RenderOptions {
@@ -66,6 +69,7 @@ impl Default for RenderOptions {
             antialiased: false,
             stats: StatsMode::None,
             pass: Pass::Inference,
+            absolute_gradients: true,
         }
     }
 }

@@ -10,7 +10,7 @@ use crate::splats::Splats;
 use crate::stats::{RenderStats, SplatStats};
 use crate::view_params::view_params;
 use burn::backend::Dispatch;
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Int, Tensor};
 use gazesplat_core::Camera;
 
 /// A drawn frame.
@@ -18,6 +18,9 @@ use gazesplat_core::Camera;
 pub struct Rendered {
     /// `[H, W, 4]`: RGB composited over the background, and alpha = 1 − T; `[H, W, 5]` with depth, Σ T α z.
     pub image: Tensor<3>,
+    /// Of a frame that keeps what a gradient needs: the Gaussians in view, those whose contour α = 1/255 reaches the image.
+    /// The first [`RenderStats::num_visible`] values are their rows; on a GPU more may follow, which mean nothing.
+    pub visible: Tensor<1, Int>,
     /// What was done and what was skipped.
     pub stats: RenderStats,
     /// Counters per Gaussian, if asked for.
@@ -35,7 +38,7 @@ impl MeansProbe {
     }
 
     /// After `backward`: `[N, 4]` = (∂L/∂x, ∂L/∂y, Σ|∂L/∂x|, Σ|∂L/∂y|) of the projected means in pixels, the last two
-    /// summed per pixel (Ye 2024). `None` if no gradient arrived.
+    /// summed per pixel (Ye 2024), zero without [`RenderOptions::absolute_gradients`]. `None` if no gradient arrived.
     pub fn gradient(&self, gradients: &burn::tensor::Gradients) -> Option<Tensor<2>> {
         self.0.grad(gradients)
     }
@@ -100,7 +103,8 @@ pub fn render_with(splats: &Splats, probes: Probes<'_>, camera: &Camera, options
     let frame = frame(splats, camera, options)?;
     let out = <Dispatch as RenderOps>::render_forward(parameters(splats), probe(splats, probes), frame);
     let (stats, splat_stats) = out.outcome?;
-    Ok(Rendered { image: Tensor::from_dispatch(out.image), stats, splat_stats })
+    let visible = Tensor::from_dispatch(out.saved.global_from_compact);
+    Ok(Rendered { image: Tensor::from_dispatch(out.image), visible, stats, splat_stats })
 }
 
 /// The leaves, empty where nobody asks.
@@ -177,6 +181,7 @@ fn frame(splats: &Splats, camera: &Camera, options: &RenderOptions) -> Result<Fr
             background: options.background,
             depth: options.depth,
             smooth_cutoff: options.pass == Pass::SmoothCutoff,
+            absolute_gradients: options.absolute_gradients,
         },
         sh_degree,
         stats: options.stats,

@@ -18,12 +18,29 @@ use std::path::Path;
 /// Format of the tensors and of what every checkpoint holds.
 const FORMAT: &str = "gazesplat checkpoint 1";
 
+/// Before the names of vectors.
+const VECTORS: &str = "vectors";
+
 /// Writes a checkpoint of a run of kind `kind`: `meta` and the named states. A checkpoint that was there before stays
 /// until the new one is complete on the disk.
 ///
 /// # Errors
 /// [`Error::Scene`] when the file cannot be written.
 pub fn save(path: &Path, kind: &str, meta: &impl Serialize, states: &[(&str, &HostState)]) -> Result<()> {
+    save_with(path, kind, meta, states, &[])
+}
+
+/// [`save`], with named vectors beside the states.
+///
+/// # Errors
+/// As [`save`].
+pub fn save_with(
+    path: &Path,
+    kind: &str,
+    meta: &impl Serialize,
+    states: &[(&str, &HostState)],
+    vectors: &[(&str, &[f32])],
+) -> Result<()> {
     let mut info = HashMap::from([
         ("format".to_owned(), FORMAT.to_owned()),
         ("kind".to_owned(), kind.to_owned()),
@@ -47,6 +64,11 @@ pub fn save(path: &Path, kind: &str, meta: &impl Serialize, states: &[(&str, &Ho
             }
         }
     }
+    for (name, values) in vectors {
+        let view = TensorView::new(Dtype::F32, vec![values.len()], bytemuck::cast_slice(values))
+            .expect("a vector has the size of its shape");
+        tensors.push((format!("{VECTORS}.{name}"), view));
+    }
     let bytes = safetensors::serialize(tensors, Some(info)).expect("finite shapes and plain text");
     Ok(write_atomically(path, |file| file.write_all(&bytes))?)
 }
@@ -57,6 +79,7 @@ pub struct Loaded<M> {
     /// What [`save`] was given.
     pub meta: M,
     states: Vec<(String, HostState)>,
+    vectors: Vec<(String, Vec<f32>)>,
 }
 
 impl<M> Loaded<M> {
@@ -64,6 +87,12 @@ impl<M> Loaded<M> {
     pub fn take(&mut self, name: &str) -> Option<HostState> {
         let at = self.states.iter().position(|(found, _)| found == name)?;
         Some(self.states.swap_remove(at).1)
+    }
+
+    /// Takes the vector of that name out.
+    pub fn take_vector(&mut self, name: &str) -> Option<Vec<f32>> {
+        let at = self.vectors.iter().position(|(found, _)| found == name)?;
+        Some(self.vectors.swap_remove(at).1)
     }
 }
 
@@ -107,7 +136,15 @@ pub fn load<M: DeserializeOwned>(path: &Path, kind: &str, names: &[&str]) -> Res
         let last = words(&file, &format!("{name}.last"), rows.num_rows(), num_updates).map_err(refuse)?;
         states.push((name.to_owned(), HostState { rows, num_updates, last }));
     }
-    Ok(Loaded { meta, states })
+    let mut vectors = Vec::new();
+    for (name, tensor) in file.tensors() {
+        let Some(name) = name.strip_prefix(VECTORS).and_then(|rest| rest.strip_prefix('.')) else { continue };
+        if tensor.dtype() != Dtype::F32 {
+            return Err(refuse(format!("damaged: `{name}` is {:?}", tensor.dtype())));
+        }
+        vectors.push((name.to_owned(), tensor.data().chunks_exact(4).map(float).collect()));
+    }
+    Ok(Loaded { meta, states, vectors })
 }
 
 /// A word per row, or none where no row lags.
@@ -223,8 +260,12 @@ mod tests {
     fn what_is_saved_comes_back_bit_for_bit() {
         let dir = tempfile::tempdir().expect("temporary directory");
         let path = dir.path().join("checkpoint");
-        save(&path, "test", &(3u32, "text"), &[("state", &state()), ("best", &state())]).expect("writable");
+        let (states, memory) = ([("state", &state()), ("best", &state())], [0.1, f32::MIN_POSITIVE, -0.0]);
+        save_with(&path, "test", &(3u32, "text"), &states, &[("memory", &memory)]).expect("writable");
         let mut loaded: Loaded<(u32, String)> = load(&path, "test", &["state", "best", "none"]).expect("readable");
+        let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
+        assert_eq!(loaded.take_vector("memory").map(bits), Some(bits(memory.to_vec())));
+        assert_eq!(loaded.take_vector("memory"), None);
         assert_eq!(loaded.meta, (3, "text".to_owned()));
         assert_eq!(loaded.take("state"), Some(state()));
         assert_eq!(loaded.take("best"), Some(state()));

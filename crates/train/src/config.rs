@@ -6,6 +6,7 @@
 use crate::error::{Error, Result};
 pub use gazesplat_core::dataset::Holdout;
 use gazesplat_render::RenderOptions;
+use gazesplat_render::layout::ALPHA_MIN;
 use serde::{Deserialize, Serialize};
 
 /// All settings of a training run.
@@ -255,6 +256,8 @@ impl Default for OptimSection {
 pub enum StrategyKind {
     /// Relocation, growth and position noise of Kheradmand 2024.
     Mcmc,
+    /// Clone, split, prune and opacity reset of Kerbl 2023.
+    Adc,
     /// The initial Gaussians are only optimised.
     None,
 }
@@ -263,20 +266,21 @@ pub enum StrategyKind {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct DensifySection {
-    /// `"mcmc"` or `"none"`. Default `"mcmc"`.
+    /// `"mcmc"`, `"adc"` or `"none"`. Default `"mcmc"`.
     pub strategy: StrategyKind,
     /// Largest number of Gaussians. Default 300000.
     pub cap: usize,
     /// First step at which Gaussians are relocated and added; at most 1/20 of the run. Default 500.
     pub start: u32,
-    /// Share of the run after which the number stays as it is, in (0, 1]. Default 5/6.
-    pub stop: f32,
+    /// Share of the run after which the number stays as it is, in (0, 1]. Default 5/6, with `"adc"` 1/2.
+    pub stop: Option<f32>,
     /// Steps between two refinements; at most 1/100 of the run, at least 5. Default 100.
     pub every: u32,
-    /// Growth per refinement. Where this would not reach `cap` by the middle of the run, as in short runs, it is raised
-    /// to what does. Default 0.05.
+    /// Growth per refinement (`"mcmc"`). Where this would not reach `cap` by the middle of the run, as in short runs, it is
+    /// raised to what does. Default 0.05.
     pub growth: f32,
-    /// A Gaussian of at most this opacity is dead and moved to a live one. Default 0.005.
+    /// A Gaussian of at most this opacity is dead and moved to a live one (`"mcmc"`), below it is removed (`"adc"`).
+    /// Default 0.005.
     pub min_opacity: f32,
     /// Position noise as a multiple of the rate of the means (MCMC, Eq. 8). Default 5e5.
     pub noise: f32,
@@ -284,6 +288,24 @@ pub struct DensifySection {
     pub opacity_regularizer: f32,
     /// Weight of the mean scale in the loss (MCMC, Eq. 10). Default 0.01.
     pub scale_regularizer: f32,
+    /// A Gaussian whose image-plane gradient, in half images and averaged over the steps that saw it, is above this is
+    /// cloned or split (`"adc"`). Default 2e-4 (3DGS), with `absolute_gradients` 8e-4.
+    pub grow_gradient: Option<f32>,
+    /// Take the sums of the magnitudes of per-pixel gradients, which do not cancel within a large Gaussian (`"adc"`;
+    /// Ye 2024). Default false.
+    pub absolute_gradients: bool,
+    /// A Gaussian that grows is cloned if its largest scale is at most this, in scene extents, else split (`"adc"`).
+    /// Default 0.01 (3DGS).
+    pub clone_scale: f32,
+    /// A Gaussian with a larger scale, in scene extents, is removed once opacities have been lowered (`"adc"`). Default 0.1
+    /// (3DGS).
+    pub max_scale: f32,
+    /// Steps between two lowerings of all opacities (`"adc"`); 0 = never. At most 1/10 of the run, but not below 300 for
+    /// that. Default 3000 (3DGS).
+    pub reset_every: u32,
+    /// What opacities are lowered to (`"adc"`); above `min_opacity` and 1/255, below which nothing is drawn. Default 0.01
+    /// (3DGS).
+    pub reset_opacity: f32,
 }
 
 impl Default for DensifySection {
@@ -292,13 +314,19 @@ impl Default for DensifySection {
             strategy: StrategyKind::Mcmc,
             cap: 300_000,
             start: 500,
-            stop: 5.0 / 6.0,
+            stop: None,
             every: 100,
             growth: 0.05,
             min_opacity: 0.005,
             noise: 5e5,
             opacity_regularizer: 0.01,
             scale_regularizer: 0.01,
+            grow_gradient: None,
+            absolute_gradients: false,
+            clone_scale: 0.01,
+            max_scale: 0.1,
+            reset_every: 3000,
+            reset_opacity: 0.01,
         }
     }
 }
@@ -408,8 +436,9 @@ impl Config {
         positive("optim.sh_rest_divisor", self.optim.sh_rest_divisor)?;
         check(self.densify.cap >= 1, "densify.cap", &self.densify.cap, "at least 1")?;
         check(self.densify.every >= 1, "densify.every", &self.densify.every, "at least 1")?;
-        let stop = self.densify.stop;
-        check(stop > 0.0 && stop <= 1.0, "densify.stop", &stop, "a number in (0, 1]")?;
+        if let Some(stop) = self.densify.stop {
+            check(stop > 0.0 && stop <= 1.0, "densify.stop", &stop, "a number in (0, 1]")?;
+        }
         non_negative("densify.growth", self.densify.growth)?;
         open_unit("densify.min_opacity", self.densify.min_opacity)?;
         non_negative("densify.noise", self.densify.noise)?;
@@ -419,6 +448,14 @@ impl Config {
             // A turn by a radian per step is no refinement.
             check(rate > 0.0 && rate <= 1.0, key, &rate, "a number above 0 and at most 1")?;
         }
+        if let Some(gradient) = self.densify.grow_gradient {
+            positive("densify.grow_gradient", gradient)?;
+        }
+        positive("densify.clone_scale", self.densify.clone_scale)?;
+        positive("densify.max_scale", self.densify.max_scale)?;
+        let (lowered, least) = (self.densify.reset_opacity, self.densify.min_opacity.max(ALPHA_MIN));
+        let expected = "a number below 1, above `densify.min_opacity` and above 1/255, where nothing is drawn";
+        check(lowered > least && lowered < 1.0, "densify.reset_opacity", &lowered, expected)?;
         let ssim_weight = self.loss.ssim_weight;
         check((0.0..=1.0).contains(&ssim_weight), "loss.ssim_weight", &ssim_weight, "a number in 0..1")?;
         self.render_options().validate().map_err(|error| match error {
@@ -477,8 +514,22 @@ mod tests {
     #[test]
     fn values_out_of_range_are_named() {
         let mut config = Config::default();
-        config.densify.stop = f32::NAN;
+        config.densify.stop = Some(f32::NAN);
         let message = config.validate().expect_err("the test expects a refusal").to_string();
         assert!(message.starts_with("densify.stop") && message.contains("NaN"), "{message}");
+        let refused = |change: fn(&mut DensifySection)| {
+            let mut config = Config::default();
+            change(&mut config.densify);
+            config.validate().expect_err("the test expects a refusal").to_string()
+        };
+        for (message, key, found) in [
+            (refused(|s| s.grow_gradient = Some(0.0)), "densify.grow_gradient", "0"),
+            (refused(|s| s.clone_scale = -1.0), "densify.clone_scale", "-1"),
+            (refused(|s| s.max_scale = f32::INFINITY), "densify.max_scale", "inf"),
+            (refused(|s| s.reset_opacity = 0.0039), "densify.reset_opacity", "0.0039"),
+            (refused(|s| s.min_opacity = 0.02), "densify.reset_opacity", "0.01"),
+        ] {
+            assert!(message.starts_with(key) && message.contains(&format!("found {found},")), "{message}");
+        }
     }
 }

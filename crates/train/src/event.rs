@@ -2,7 +2,8 @@
 
 use crate::evaluate::EvalReport;
 use crate::losses::LossTerms;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use std::fmt;
 
 /// Milliseconds spent in the stages of one step; on a GPU to queue their work, and to wait where something is read back.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -43,19 +44,104 @@ pub struct StepReport {
     pub view: String,
     /// What densification did, when it was its turn.
     pub densified: Option<DensifyReport>,
+    /// What densification did since the run began.
+    pub totals: DensifyReport,
 }
 
-/// What a change in the number or places of Gaussians did.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize)]
+/// Gaussians that no viewer can do anything with, each counted under the first reason that applies.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BrokenCounts {
+    /// A value is not finite.
+    pub non_finite: usize,
+    /// A standard deviation is larger than anything a scene holds.
+    pub huge: usize,
+    /// The centre is farther away than anything a scene shows.
+    pub far: usize,
+}
+
+impl BrokenCounts {
+    /// All of them.
+    pub fn total(&self) -> usize {
+        self.non_finite + self.huge + self.far
+    }
+}
+
+/// `2 not finite, 1 huge`: the reasons that apply.
+impl fmt::Display for BrokenCounts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let named = [(self.non_finite, "not finite"), (self.huge, "huge"), (self.far, "far away")];
+        let mut separator = "";
+        for (count, name) in named.into_iter().filter(|(count, _)| *count > 0) {
+            write!(f, "{separator}{count} {name}")?;
+            separator = ", ";
+        }
+        Ok(())
+    }
+}
+
+/// What a change in the number or places of Gaussians did, or several of them.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DensifyReport {
-    /// Transparent Gaussians that were moved to live ones.
+    /// Transparent Gaussians that were moved to live ones (MCMC).
     pub num_relocated: usize,
-    /// Gaussians that were moved because a parameter was not finite, or they were beyond any plausible size or distance.
-    pub num_relocated_broken: usize,
-    /// Gaussians added.
+    /// Gaussians that were removed, or moved to live ones (MCMC), because nothing could be done with them.
+    pub broken: BrokenCounts,
+    /// Gaussians removed because hardly anything is seen of them (ADC).
+    pub num_transparent: usize,
+    /// Gaussians removed because they are large for the scene (ADC).
+    pub num_large: usize,
+    /// Gaussians copied to where they are (ADC).
+    pub num_cloned: usize,
+    /// Gaussians replaced by two smaller ones (ADC).
+    pub num_split: usize,
+    /// Gaussians added by any of these.
     pub num_added: usize,
+    /// Times that all opacities were lowered (ADC).
+    pub num_opacity_resets: usize,
     /// Gaussians afterwards.
     pub num_gaussians: usize,
+}
+
+impl DensifyReport {
+    /// Adds what a later change did.
+    pub fn add(&mut self, later: &Self) {
+        self.num_relocated += later.num_relocated;
+        self.broken.non_finite += later.broken.non_finite;
+        self.broken.huge += later.broken.huge;
+        self.broken.far += later.broken.far;
+        self.num_transparent += later.num_transparent;
+        self.num_large += later.num_large;
+        self.num_cloned += later.num_cloned;
+        self.num_split += later.num_split;
+        self.num_added += later.num_added;
+        self.num_opacity_resets += later.num_opacity_resets;
+        self.num_gaussians = later.num_gaussians;
+    }
+}
+
+/// `12 added (8 cloned, 4 split), 3 transparent removed, 1 broken (1 huge), 96 Gaussians`: what happened, the rest left out.
+impl fmt::Display for DensifyReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} added", self.num_added)?;
+        if self.num_cloned + self.num_split > 0 {
+            write!(f, " ({} cloned, {} split)", self.num_cloned, self.num_split)?;
+        }
+        let named = [
+            (self.num_relocated, "relocated"),
+            (self.num_transparent, "transparent removed"),
+            (self.num_large, "large removed"),
+        ];
+        for (count, name) in named.into_iter().filter(|(count, _)| *count > 0) {
+            write!(f, ", {count} {name}")?;
+        }
+        if self.broken.total() > 0 {
+            write!(f, ", {} broken ({})", self.broken.total(), self.broken)?;
+        }
+        if self.num_opacity_resets > 0 {
+            f.write_str(", opacities lowered")?;
+        }
+        write!(f, ", {} Gaussians", self.num_gaussians)
+    }
 }
 
 /// An event of a run.
@@ -93,7 +179,7 @@ pub enum TrainEvent<'a> {
     },
     /// A step is done. Sent for every step; logs take those that [`StepReport::is_logged`] accepts.
     Step(&'a StepReport),
-    /// Gaussians were relocated or added.
+    /// Gaussians were relocated, added or removed.
     Densified {
         /// Number of the step, counted from 1.
         step: u32,

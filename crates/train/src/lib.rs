@@ -33,6 +33,6 @@ pub mod trainer;
 pub use config::Config;
 pub use error::{Error, Result};
 pub use evaluate::{EvalReport, ViewScore, evaluate};
-pub use event::{DensifyReport, Observer, StageMs, StepReport, TrainEvent};
+pub use event::{BrokenCounts, DensifyReport, Observer, StageMs, StepReport, TrainEvent};
 pub use run::{Outcome, run, with_threads};
 pub use trainer::Trainer;

@@ -20,7 +20,7 @@ pub(crate) fn check_limits(
 ) -> Result<()> {
     let Some(gpu) = gazesplat_render::gpu::Gpu::from_device(device) else { return Ok(()) };
     let num_gaussians = match config.densify.strategy {
-        StrategyKind::Mcmc => num_rows.max(config.densify.cap),
+        StrategyKind::Mcmc | StrategyKind::Adc => num_rows.max(config.densify.cap),
         StrategyKind::None => num_rows,
     };
     gpu.check_model(num_gaussians, num_coefficients.max(sh::num_coefficients(config.model.sh_degree)))?;

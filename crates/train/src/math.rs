@@ -90,6 +90,26 @@ pub fn covariance_times(q: Quat, log_scales: Vec3, v: Vec3) -> Vec3 {
     Vec3 { x: dot(r.row0, local), y: dot(r.row1, local), z: dot(r.row2, local) }
 }
 
+/// R diag(s) v for an unnormalised quaternion and the logarithms of s: where v, drawn from a standard normal distribution,
+/// lies in the Gaussian of that shape.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn shaped(q: Quat, log_scales: Vec3, v: Vec3) -> Vec3 {
+    let norm_squared = q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z;
+    let inverse = 1.0 / f32::sqrt(f32::max(norm_squared, 1e-12));
+    let r = rotation(Quat { w: q.w * inverse, x: q.x * inverse, y: q.y * inverse, z: q.z * inverse });
+    let local =
+        Vec3 { x: f32::exp(log_scales.x) * v.x, y: f32::exp(log_scales.y) * v.y, z: f32::exp(log_scales.z) * v.z };
+    Vec3 { x: dot(r.row0, local), y: dot(r.row1, local), z: dot(r.row2, local) }
+}
+
+/// Length of a gradient in the image plane.
+#[cfg_attr(feature = "gpu", cube)]
+#[inline(always)]
+pub fn image_norm(x: f32, y: f32) -> f32 {
+    f32::sqrt(x * x + y * y)
+}
+
 /// −ln(1 − o) of the opacity o = σ(logit), that is ln(1 + e^logit): of n equal parts each has an n-th of it.
 ///
 /// By ln(1 + t) = 2 artanh(t / (2 + t)), whose series needs seven terms for t ≤ 1: the logarithm of a shader has an

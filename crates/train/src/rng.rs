@@ -22,7 +22,7 @@ pub enum Stream {
     Init = 2,
     /// Background colour of a step.
     Background = 3,
-    /// Which Gaussians are split or take in a dead one.
+    /// Which Gaussians take in a dead one (MCMC), and where the parts of one that is split go (ADC).
     Sampling = 4,
     /// Position noise of a step.
     Noise = 5,

@@ -4,18 +4,19 @@
 //! graph is gone updates them where they are: nothing of the model's size is copied. SH bands that are not learned yet
 //! are not stored, so that a young model is a quarter of the size of a grown one.
 //!
-//! On a GPU a step only queues work, unless scales decay: the counters that takes are read back. The host reads the loss
-//! in the steps that are reported, and before it measures or ends; a loss that is not finite stops the model on the device
-//! at once, and the run at the next such read.
+//! On a GPU a step only queues work, unless scales decay: the counters that takes are read back, and so are the counts of
+//! the steps that add, move or remove Gaussians. The host reads the loss in the steps that are reported, and before it
+//! measures or ends; a loss that is not finite stops the model on the device at once, and the run at the next such read.
 //!
-//! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`.
+//! The file is long because the state of a run and the step over it are read together; checkpoints are in `resume`, what
+//! strategies see in `watch`, what leaves in `export`.
 
 use crate::backend::Status;
-use crate::config::{Config, StrategyKind};
-use crate::densify::{Fixed, Mcmc, StepContext, Strategy};
+use crate::config::Config;
+use crate::densify::{self, Bounds, Fixed, StepContext, Strategy, Watched};
 use crate::error::{Error, Offender, Result};
 use crate::evaluate::{EvalReport, evaluate};
-use crate::event::{StageMs, StepReport};
+use crate::event::{DensifyReport, StageMs, StepReport};
 use crate::init::{Initial, camera_center, initial_cloud, positive_extent};
 use crate::kernels::cpu::rows::Rows;
 use crate::limits::check_limits;
@@ -30,12 +31,16 @@ use gazesplat_render::{Pass, Probes, RenderOptions, Rendered, Splats, StatsMode,
 use std::sync::Arc;
 
 mod clock;
+mod export;
 mod poses;
 mod resume;
 mod views;
+mod watch;
 
 use clock::Clock;
+pub use export::Exported;
 use poses::Poses;
+use watch::Watch;
 
 /// γ of scale decay (RTGS Eq. 4).
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,6 +58,8 @@ pub struct Trainer {
     test_images: Arc<ImageCache>,
     state: ModelState,
     strategy: Box<dyn Strategy>,
+    /// What densification did since step 0.
+    totals: DensifyReport,
     /// Gaussians at step 0, of which the schedule of growth is a function.
     num_initial: usize,
     /// Step at which the rows were last sorted.
@@ -116,10 +123,8 @@ impl Trainer {
         let extent = positive_extent(dataset.scene_extent());
         let cameras: Vec<Camera> = images.views().iter().map(|v| v.camera).collect();
         let center: [f32; 3] = camera_center(&cameras).into();
-        let strategy: Box<dyn Strategy> = match config.densify.strategy {
-            StrategyKind::Mcmc => Box::new(Mcmc::new(&config.densify, config.train.steps, num_initial, center, extent)),
-            StrategyKind::None => Box::new(Fixed),
-        };
+        let bounds = Bounds::of_scene(center, extent);
+        let strategy = densify::strategy(&config.densify, config.train.steps, num_initial, bounds, extent);
         let losses = WeightedLosses::default().with(1.0, Box::new(L1Ssim { ssim_weight: config.loss.ssim_weight }));
         let mut state = state;
         if config.optim.visible_only {
@@ -132,6 +137,7 @@ impl Trainer {
             images,
             state,
             strategy,
+            totals: DensifyReport { num_gaussians: num_initial, ..DensifyReport::default() },
             num_initial,
             sorted_at: 0,
             losses,
@@ -188,7 +194,8 @@ impl Trainer {
             images: Arc::clone(&self.images),
             test_images: Arc::clone(&self.test_images),
             state: ModelState::new(rows.params, AdamSettings::default(), self.state.device())?,
-            strategy: Box::new(Fixed),
+            strategy: Box::new(Fixed::untouched()),
+            totals: DensifyReport { num_gaussians: cloud.len(), ..DensifyReport::default() },
             num_initial: cloud.len(),
             sorted_at: 0,
             losses: std::mem::take(&mut self.losses),
@@ -201,6 +208,11 @@ impl Trainer {
             coarse: None,
             messages: Vec::new(),
         })
+    }
+
+    /// This trainer, with every row left to its caller.
+    pub(crate) fn keeping_rows(self) -> Self {
+        Self { strategy: Box::new(Fixed::untouched()), ..self }
     }
 
     /// Goes on at step `step` with the model of `snapshot`.
@@ -251,22 +263,6 @@ impl Trainer {
         &self.messages
     }
 
-    /// The model as it is exported: of the degree of the settings, Gaussians with a non-finite value left out.
-    ///
-    /// # Errors
-    /// [`Error::Render`] when the device does not answer.
-    pub fn to_cloud(&self) -> Result<GaussianCloud> {
-        self.exported(&self.state.current_lent()?)
-    }
-
-    /// [`Trainer::to_cloud`] of another state of the model.
-    pub(crate) fn exported(&self, splats: &Splats) -> Result<GaussianCloud> {
-        let cloud = splats.to_cloud()?;
-        let cloud = cloud.with_sh_degree(cloud.sh_degree.max(self.config.model.sh_degree));
-        let valid: Vec<usize> = (0..cloud.len()).filter(|&i| cloud.is_row_valid(i)).collect();
-        Ok(if valid.len() == cloud.len() { cloud } else { cloud.select(&valid) })
-    }
-
     /// Quality on the test views.
     ///
     /// # Errors
@@ -289,16 +285,24 @@ impl Trainer {
         let view = self.view_at(self.step);
         let (photo, camera) = self.photo(view)?;
         let (camera, pose) = self.camera_of(view, camera)?;
-        let probes = Probes { pose: pose.as_ref(), ..Probes::default() };
         let background = self.background();
         let target = LossTarget::new(photo, background);
         stage_ms.image = clock.lap();
 
         let stats = if self.scale_decay.is_some() { StatsMode::Tiles } else { StatsMode::None };
-        let options = RenderOptions { background, pass: Pass::Train, stats, ..self.config.render_options() };
+        let watched = self.strategy.watches(self.step + 1);
+        let options = RenderOptions {
+            background,
+            pass: Pass::Train,
+            stats,
+            absolute_gradients: watched == Some(Watched::Absolute),
+            ..self.config.render_options()
+        };
         self.state.prepare(&camera, options.near)?;
         let leaves = tracked(&self.state.lent());
-        let Rendered { image, splat_stats, .. } = render_with(&leaves, probes, &camera, &options)?;
+        let watch = watched.map(|_| Watch::new(&leaves));
+        let probes = Probes { means: watch.as_ref().map(Watch::probe), pose: pose.as_ref() };
+        let Rendered { image, splat_stats, visible, stats } = render_with(&leaves, probes, &camera, &options)?;
         stage_ms.forward = clock.lap();
 
         let pending = self.losses.evaluate(image, &target).expect("a trainer has a loss");
@@ -306,6 +310,7 @@ impl Trainer {
 
         let gradients = pending.loss.backward();
         self.note_pose(view, pose, &gradients);
+        let observation = watch.and_then(|watch| watch.observation(&gradients, visible, &stats, &camera));
         let mut gradients = taken(leaves, gradients);
         if let Some(ScaleDecay { weight, scale_unit }) = self.scale_decay {
             let log_scales = self.state.lent().log_scales;
@@ -334,11 +339,17 @@ impl Trainer {
         self.ease_poses()?;
         stage_ms.optim = clock.lap();
 
+        if let Some(seen) = observation {
+            self.strategy.observe(seen);
+        }
         let context = StepContext { step: self.step, seed: self.config.train.seed, means_lr: rates.means };
         let densified = self.strategy.after_update(&mut self.state, &context)?;
         if densified.is_some() && self.step >= self.sorted_at + SORT_INTERVAL {
             self.state.sort_spatially(self.center, SORT_EXTENTS * self.extent)?;
             self.sorted_at = self.step;
+        }
+        if let Some(report) = &densified {
+            self.totals.add(report);
         }
         stage_ms.densify = clock.lap();
         stage_ms.total = clock.total();
@@ -351,6 +362,7 @@ impl Trainer {
             stage_ms,
             view: self.images.views()[view].name.clone(),
             densified,
+            totals: self.totals,
         })
     }
 

@@ -230,6 +230,117 @@ fn a_gpu_densifies_to_the_quality_of_the_cpu() {
     assert_eq!(gpu.terms, cpu.terms);
 }
 
+fn adc(steps: u32, cap: usize) -> Config {
+    let mut config = config(steps, cap);
+    config.densify.strategy = StrategyKind::Adc;
+    config
+}
+
+#[test]
+fn adc_grows_where_the_image_needs_it_and_beats_no_densification() {
+    let (_scratch, dataset) = scene("adc", 32);
+    let run_with = |config: &Config| {
+        let mut trainer = trainer(&dataset, config);
+        let mut log = Log::default();
+        run(&mut trainer, &mut [&mut log], &AtomicBool::new(false)).unwrap();
+        trainer.to_cloud().unwrap().validate().unwrap();
+        (log.psnr.unwrap(), trainer.num_gaussians(), log)
+    };
+    let mut fixed = config(800, 6000);
+    fixed.densify.strategy = StrategyKind::None;
+    let (without, num_initial, log) = run_with(&fixed);
+    assert_eq!(log.num_densified, 0, "a report is for steps in which something changed");
+    for absolute_gradients in [false, true] {
+        let mut config = adc(800, 6000);
+        config.densify.absolute_gradients = absolute_gradients;
+        let (with, num_gaussians, log) = run_with(&config);
+        println!(
+            "absolute {absolute_gradients}: {with:.2} dB with {num_gaussians} Gaussians, {without:.2} dB with {num_initial}"
+        );
+        assert!(log.num_densified > 10);
+        assert!(num_gaussians > num_initial * 5 / 4 && num_gaussians <= 6000, "{num_gaussians}");
+        assert!(with > without + 0.3, "{with} {without}");
+    }
+}
+
+#[test]
+fn the_model_of_adc_does_not_depend_on_the_number_of_threads() {
+    let (_scratch, dataset) = scene("adc-threads", 9);
+    let mut config = adc(60, 3000);
+    // Early enough for refinements on either side of a reset.
+    config.densify.reset_every = 15;
+    let clouds: Vec<_> = [1, 2, 3]
+        .into_iter()
+        .map(|threads| {
+            with_threads(threads, || {
+                let mut trainer = trainer(&dataset, &config);
+                run(&mut trainer, &mut [], &AtomicBool::new(false)).unwrap();
+                trainer.to_cloud().unwrap()
+            })
+            .unwrap()
+        })
+        .collect();
+    assert!(clouds.windows(2).all(|w| w[0] == w[1]));
+    assert!(clouds[0].len() > 2000, "{}", clouds[0].len());
+}
+
+#[test]
+fn a_gpu_follows_adc_to_the_quality_of_the_cpu() {
+    let Some([(cpu, cpu_trained, cpu_cloud), (gpu, gpu_trained, gpu_cloud)]) =
+        on_cpu_and_gpu("adc-gpu", &adc(250, 6000))
+    else {
+        return;
+    };
+    let (expected, found) = (cpu_cloud.len() as f64, gpu_cloud.len() as f64);
+    println!("training PSNR: CPU {cpu_trained:.3} dB, GPU {gpu_trained:.3} dB; Gaussians: {expected}, {found}");
+    // As for MCMC: one rounding on the threshold is another Gaussian, and from there on it is another run.
+    assert!((gpu_trained - cpu_trained).abs() < 0.3);
+    assert!((found / expected - 1.0).abs() < 0.05 && expected > 2200.0, "{found} {expected}");
+    assert_eq!(gpu.num_densified, cpu.num_densified);
+    assert_eq!(gpu.terms, cpu.terms);
+}
+
+#[test]
+fn broken_gaussians_go_under_every_strategy_and_are_counted_by_reason() {
+    let (_scratch, dataset) = scene("broken", 4);
+    let extent = dataset.scene_extent();
+    let mut devices = vec![cpu_device()];
+    devices.extend(required_gpu(gpu_device(None)));
+    for strategy in [StrategyKind::None, StrategyKind::Mcmc, StrategyKind::Adc] {
+        let mut settings = config(12, 2500);
+        settings.densify.strategy = strategy;
+        let mut cloud = trainer(&dataset, &settings).to_cloud().unwrap();
+        let num_initial = cloud.len();
+        cloud.means[7][1] = f32::NAN;
+        cloud.opacity_logits[8] = f32::INFINITY;
+        cloud.log_scales[9][0] = (300.0 * extent).ln();
+        cloud.opacity_logits[9] = -4.0;
+        cloud.means[10][2] = 1e5 * extent;
+        for device in &devices {
+            let images = Arc::new(ImageCache::new(dataset.train.clone(), settings.data.cache_bytes));
+            let mut trainer = Trainer::from_cloud(&cloud, &dataset, images, &settings, device).unwrap();
+            let dropped = trainer.export().unwrap();
+            assert_eq!((dropped.left_out.total(), dropped.cloud.len()), (4, num_initial - 4));
+            let mut reports = Vec::new();
+            let mut totals = None;
+            while trainer.step_index() < 12 {
+                let report = trainer.step().unwrap();
+                reports.extend(report.densified);
+                totals = Some(report.totals);
+            }
+            let totals = totals.unwrap();
+            let broken = totals.broken;
+            assert_eq!((broken.non_finite, broken.huge, broken.far), (2, 1, 1), "{strategy:?}");
+            assert!(reports.iter().any(|report| report.broken.total() == 4));
+            assert_eq!(totals.num_gaussians, trainer.num_gaussians());
+            assert_eq!(trainer.export().unwrap().left_out.total(), 0, "{strategy:?}");
+            if strategy == StrategyKind::None {
+                assert_eq!((trainer.num_gaussians(), reports.len()), (num_initial - 4, 1));
+            }
+        }
+    }
+}
+
 #[test]
 fn a_loss_that_is_no_number_stops_the_run_and_keeps_the_model() {
     let (_scratch, dataset) = scene("nan", 4);

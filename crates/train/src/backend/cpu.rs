@@ -1,16 +1,21 @@
 //! Training on the CPU backends: tensors to vectors, vectors through the kernels, vectors to tensors; all without a copy
 //! as long as nothing else shares the tensors.
 
-use super::{AdamUpdate, Changed, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State, Status};
+use super::{
+    AdamUpdate, Changed, Densification, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State, StatisticStep, Status,
+};
+use crate::densify::Bounds;
 use crate::event::DensifyReport;
 use crate::kernels::cpu::{
     adam,
+    densify::{add_statistic, densify},
     noise::add_noise,
     regularize::regularize,
     relocate::refine,
     rows::Rows,
     scale_decay::add_scale_decay,
     seen::{self, Missing},
+    sweep::sweep,
 };
 use crate::optim::missed::missed;
 use crate::optim::{Columns, Group, LearningRates, SeenBy};
@@ -177,6 +182,18 @@ fn host_scale_decay<B: HostTensors>(
     gradients
 }
 
+fn host_statistic<B: HostTensors>(
+    mut statistic: FloatTensor<B>,
+    gradient: &FloatTensor<B>,
+    visible: &IntTensor<B>,
+    step: &StatisticStep,
+) -> FloatTensor<B> {
+    let (gradient, visible) = (B::f32_slice(gradient), B::i32_slice(visible));
+    let visible = &bytemuck::cast_slice::<i32, u32>(&visible)[..step.num_visible];
+    add_statistic(B::f32_slice_mut(&mut statistic), &gradient, visible, step);
+    statistic
+}
+
 /// The same host implementation serves every CPU backend.
 macro_rules! host_optim_ops {
     ($backend:ty) => {
@@ -209,6 +226,29 @@ macro_rules! host_optim_ops {
 
             fn refine(state: State<Self>, refinement: Refinement, _shared: bool) -> Changed<Self> {
                 with_rows(state, |rows, _| refine(rows, &refinement))
+            }
+
+            fn add_statistic(
+                statistic: FloatTensor<Self>,
+                gradient: FloatTensor<Self>,
+                visible: IntTensor<Self>,
+                step: StatisticStep,
+            ) -> FloatTensor<Self> {
+                host_statistic::<Self>(statistic, &gradient, &visible, &step)
+            }
+
+            fn densify(
+                state: State<Self>,
+                statistic: FloatTensor<Self>,
+                densification: Densification,
+                _shared: bool,
+            ) -> Changed<Self> {
+                let statistic = Self::f32_into_vec(statistic);
+                with_rows(state, |rows, _| densify(rows, &statistic, &densification))
+            }
+
+            fn sweep(state: State<Self>, bounds: Bounds, _shared: bool) -> Changed<Self> {
+                with_rows(state, |rows, _| sweep(rows, &bounds))
             }
 
             fn sort_spatially(state: State<Self>, _center: [f32; 3], _half: f32) -> Changed<Self> {

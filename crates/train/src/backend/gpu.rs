@@ -4,18 +4,23 @@
 //! overwritten in place. Moments belong to the state alone; parameters do unless the caller says `shared`, which costs a
 //! copy: the reference count of an allocation with five views of it cannot tell.
 
-use super::{AdamUpdate, Changed, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State};
+use super::{
+    AdamUpdate, Changed, Densification, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State, StatisticStep,
+};
+use crate::densify::Bounds;
 use crate::event::DensifyReport;
 use crate::kernels::gpu::adam::{self, Packed};
+use crate::kernels::gpu::densify::{add_statistic, densify};
 use crate::kernels::gpu::noise::add_noise;
 use crate::kernels::gpu::regularize::regularize;
-use crate::kernels::gpu::relocate::{PackedRows, refine};
-use crate::kernels::gpu::rows::{Listed, clamp_opacities, copied, copied_words, morton_order, select_rows};
+use crate::kernels::gpu::relocate::refine;
+use crate::kernels::gpu::rows::{Listed, PackedRows, clamp_opacities, copied, copied_words, morton_order};
 use crate::kernels::gpu::scale_decay::add_scale_decay;
 use crate::kernels::gpu::seen;
+use crate::kernels::gpu::sweep::sweep;
 use crate::optim::SeenBy;
 use burn::backend::tensor::{FloatTensor, IntTensor};
-use burn_cubecl::{CubeBackend, tensor::CubeTensor};
+use burn_cubecl::CubeBackend;
 use gazesplat_render::Result;
 use gazesplat_render::backend::Parameters;
 use gazesplat_render::gpu::{Gpu, contiguous, packed::PackedLayout};
@@ -60,17 +65,6 @@ fn changed(
 fn unmoved(rows: PackedRows) -> (PackedRows, DensifyReport) {
     let report = DensifyReport { num_gaussians: rows.layout.num_rows, ..DensifyReport::default() };
     (rows, report)
-}
-
-/// All three buffers, each with the rows of `new` that `listed` says.
-fn selected(gpu: &Gpu, rows: &PackedRows, new: PackedLayout, list: &CubeTensor, listed: Listed) -> Result<PackedRows> {
-    let select = |from: &CubeTensor| select_rows(gpu, &rows.layout, from.clone(), &new, list, listed);
-    Ok(PackedRows {
-        params: select(&rows.params)?,
-        first: select(&rows.first)?,
-        second: select(&rows.second)?,
-        layout: new,
-    })
 }
 
 impl OptimOps for CubeBackend {
@@ -129,10 +123,36 @@ impl OptimOps for CubeBackend {
         changed(state, shared, |gpu, rows, state| refine(gpu, rows, &state.status, &refinement))
     }
 
+    fn add_statistic(
+        statistic: FloatTensor<Self>,
+        gradient: FloatTensor<Self>,
+        visible: IntTensor<Self>,
+        step: StatisticStep,
+    ) -> FloatTensor<Self> {
+        let gpu = Gpu::of(&statistic);
+        let statistic = contiguous(statistic);
+        add_statistic(&gpu, &statistic, &contiguous(gradient), &visible, &step);
+        statistic
+    }
+
+    fn densify(
+        state: GpuState,
+        statistic: FloatTensor<Self>,
+        densification: Densification,
+        shared: bool,
+    ) -> Changed<Self> {
+        let statistic = contiguous(statistic);
+        changed(state, shared, |gpu, rows, state| densify(gpu, rows, &state.status, &statistic, &densification))
+    }
+
+    fn sweep(state: GpuState, bounds: Bounds, shared: bool) -> Changed<Self> {
+        changed(state, shared, |gpu, rows, state| sweep(gpu, rows, &state.status, &bounds))
+    }
+
     fn sort_spatially(state: GpuState, center: [f32; 3], half: f32) -> Changed<Self> {
         changed(state, false, |gpu, rows, _| {
             let order = morton_order(gpu, &rows.layout, &rows.params, center, half)?;
-            selected(gpu, &rows, rows.layout, &order, Listed::Only).map(unmoved)
+            rows.selected(gpu, rows.layout, &order, Listed::Only).map(unmoved)
         })
     }
 
@@ -140,7 +160,7 @@ impl OptimOps for CubeBackend {
         changed(state, false, |gpu, from, _| {
             let new = PackedLayout::new(rows.len(), from.layout.num_coefficients);
             let list = gpu.upload_u32(&rows, &[rows.len()]);
-            selected(gpu, &from, new, &list, Listed::Only).map(unmoved)
+            from.selected(gpu, new, &list, Listed::Only).map(unmoved)
         })
     }
 
@@ -181,7 +201,7 @@ impl OptimOps for CubeBackend {
         changed(state, false, |gpu, rows, _| {
             let new = PackedLayout::new(rows.layout.num_rows, num_coefficients);
             let none = gpu.upload_u32(&[], &[0]);
-            selected(gpu, &rows, new, &none, Listed::Copied).map(unmoved)
+            rows.selected(gpu, new, &none, Listed::Copied).map(unmoved)
         })
     }
 }

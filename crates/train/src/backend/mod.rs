@@ -11,6 +11,7 @@ mod cpu;
 #[cfg(feature = "gpu")]
 mod gpu;
 
+use crate::densify::Bounds;
 use crate::event::DensifyReport;
 use crate::optim::{AdamSettings, LearningRates, Regularizers, SeenBy, ShRates};
 use burn::backend::{
@@ -133,12 +134,8 @@ pub struct Refinement {
     pub cap: usize,
     /// A row of at most this opacity is dead.
     pub min_opacity: f32,
-    /// Middle of the scene, world units.
-    pub center: [f32; 3],
-    /// A row with a larger log scale is broken.
-    pub max_log_scale: f32,
-    /// A row farther from the centre along an axis is broken, world units.
-    pub max_distance: f32,
+    /// A row beyond these is broken.
+    pub bounds: Bounds,
 }
 
 impl Refinement {
@@ -147,6 +144,40 @@ impl Refinement {
         let grown = (num_rows as f64 * f64::from(self.growth)).round() as usize;
         grown.min(self.cap).saturating_sub(num_rows)
     }
+}
+
+/// The part of one view in the statistic of ADC.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StatisticStep {
+    /// Rows that the view saw.
+    pub num_visible: usize,
+    /// Half the width and half the height of the image, pixels.
+    pub half_size: [f32; 2],
+    /// Take the sums of magnitudes instead of the gradient (Ye 2024).
+    pub absolute: bool,
+}
+
+/// One clone, split, prune and opacity reset (3DGS, Sec. 5.2).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Densification {
+    /// Seed of the run.
+    pub seed: u64,
+    /// Number of the step, counted from 1.
+    pub step: u32,
+    /// Largest number of rows.
+    pub cap: usize,
+    /// A row whose mean statistic is above this grows.
+    pub grow_gradient: f32,
+    /// A row that grows is cloned if its largest log scale is at most this, else split.
+    pub max_clone_log_scale: f32,
+    /// A row with a lower opacity logit is removed.
+    pub min_logit: f32,
+    /// A row with a larger log scale is removed, once that is asked for.
+    pub max_log_scale: Option<f32>,
+    /// A row beyond these is removed.
+    pub bounds: Bounds,
+    /// Lower opacity logits to this and forget their moments, when it is time.
+    pub reset_logit: Option<f32>,
 }
 
 /// The operations of training. No default bodies: a backend without a kernel does not compile.
@@ -186,6 +217,29 @@ pub trait OptimOps: Backend {
     /// Moves dead rows onto live ones and adds rows. On a GPU with one read-back of four counts: the report names them,
     /// and nothing may grow out of a model without live rows.
     fn refine(#[extension_type] state: State<Self>, refinement: Refinement, shared: bool) -> Changed<Self>;
+
+    /// `statistic`, `[N, 2]`, with what one view adds: to its first column the norm of the image-plane gradient of the rows
+    /// it saw, in half images, to its second the number of views. `gradient`: `[N, 4]` as a probe receives it; `visible`:
+    /// the rows. On a GPU `statistic` is overwritten in place.
+    fn add_statistic(
+        statistic: FloatTensor<Self>,
+        gradient: FloatTensor<Self>,
+        visible: IntTensor<Self>,
+        step: StatisticStep,
+    ) -> FloatTensor<Self>;
+
+    /// Clones, splits and removes rows by the mean of `statistic`, `[N, 2]`, and lowers the opacities when it is time. On a
+    /// GPU four words per row are read back; nothing is done to a model of which no row would be left.
+    fn densify(
+        #[extension_type] state: State<Self>,
+        statistic: FloatTensor<Self>,
+        densification: Densification,
+        shared: bool,
+    ) -> Changed<Self>;
+
+    /// Removes the rows beyond `bounds`, unless all are. On a GPU with one read-back of four counts, and of a word per row
+    /// if there are any.
+    fn sweep(#[extension_type] state: State<Self>, bounds: Bounds, shared: bool) -> Changed<Self>;
 
     /// Orders the rows along a Morton curve, so that neighbours in memory are neighbours in space: by the box around
     /// the means on a CPU, on a GPU by the cube of `half` world units around `center`, which needs no read-back.

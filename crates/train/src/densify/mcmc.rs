@@ -3,31 +3,20 @@
 //!
 //! Sources are drawn with probability proportional to opacity. Deviations, both ours: in runs that are too short for
 //! 5 % growth to reach the cap by mid-run, growth is raised to what does, and refinements come more often (the paper
-//! knows one length only); and Gaussians with a non-finite parameter, or of absurd size or distance, count as dead.
+//! knows one length only); and Gaussians with a non-finite parameter, or of absurd size or distance ([`Bounds`]), count as dead.
 
-use super::{StepContext, Strategy};
+use super::{Bounds, StepContext, Strategy, Sweeps, Timing};
 use crate::backend::{NoiseUpdate, Refinement};
 use crate::config::DensifySection;
 use crate::error::Result;
 use crate::event::DensifyReport;
 use crate::optim::{ModelState, Regularizers};
 
-/// A standard deviation beyond this many scene extents is broken, not large: skies need less than ten.
-const MAX_SCALE_EXTENTS: f32 = 100.0;
-/// A centre beyond this many scene extents from the origin of the scene is lost: no view can resolve its parallax.
-const MAX_DISTANCE_EXTENTS: f32 = 1e4;
-/// Shortest interval of refinements in steps: new Gaussians need a few views before opacity says which of them live.
-const MIN_INTERVAL: u32 = 5;
-
 /// When refinements happen and how much they add.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Plan {
-    /// First refinement, counted from step 1.
-    pub start: u32,
-    /// No refinement after this step.
-    pub stop: u32,
-    /// Steps between two.
-    pub every: u32,
+    /// When.
+    pub timing: Timing,
     /// Growth factor of each, above 1.
     pub growth: f32,
 }
@@ -35,17 +24,12 @@ pub struct Plan {
 impl Plan {
     /// The plan of a run of `num_steps` that begins with `num_initial` Gaussians.
     pub fn new(section: &DensifySection, num_steps: u32, num_initial: usize) -> Self {
-        let every = (num_steps / 100).clamp(MIN_INTERVAL.min(section.every), section.every);
-        let start = section.start.min(num_steps / 20).max(1);
-        let stop = (f64::from(num_steps) * f64::from(section.stop)).round() as u32;
+        let timing = Timing::new(section, num_steps);
+        let Timing { start, stop, every } = timing;
         let num_until_middle = (num_steps / 2).min(stop).saturating_sub(start) / every;
         let needed = section.cap as f64 / num_initial.max(1) as f64;
         let raised = if num_until_middle > 0 { needed.powf(1.0 / f64::from(num_until_middle)) } else { 1.0 };
-        Self { start, stop, every, growth: (1.0 + section.growth).max(raised as f32) }
-    }
-
-    fn is_due(&self, step: u32) -> bool {
-        step >= self.start && step <= self.stop && (step - self.start).is_multiple_of(self.every)
+        Self { timing, growth: (1.0 + section.growth).max(raised as f32) }
     }
 }
 
@@ -54,15 +38,14 @@ impl Plan {
 pub struct Mcmc {
     section: DensifySection,
     plan: Plan,
-    extent: f32,
-    center: [f32; 3],
+    sweeps: Sweeps,
 }
 
 impl Mcmc {
-    /// A strategy for a run of `num_steps` from `num_initial` Gaussians in a scene of radius `extent` around `center`.
-    pub fn new(section: &DensifySection, num_steps: u32, num_initial: usize, center: [f32; 3], extent: f32) -> Self {
+    /// A strategy for a run of `num_steps` from `num_initial` Gaussians in a scene of these bounds.
+    pub fn new(section: &DensifySection, num_steps: u32, num_initial: usize, bounds: Bounds) -> Self {
         let plan = Plan::new(section, num_steps, num_initial);
-        Self { section: section.clone(), plan, extent, center }
+        Self { section: section.clone(), plan, sweeps: Sweeps::new(0, num_steps, bounds) }
     }
 
     /// When refinements happen and how much they add.
@@ -78,9 +61,7 @@ impl Mcmc {
             growth: self.plan.growth,
             cap: self.section.cap,
             min_opacity: self.section.min_opacity,
-            center: self.center,
-            max_log_scale: (MAX_SCALE_EXTENTS * self.extent).ln(),
-            max_distance: MAX_DISTANCE_EXTENTS * self.extent,
+            bounds: self.sweeps.bounds(),
         }
     }
 }
@@ -91,13 +72,13 @@ impl Strategy for Mcmc {
     }
 
     fn after_update(&mut self, state: &mut ModelState, context: &StepContext) -> Result<Option<DensifyReport>> {
-        let report = match self.plan.is_due(context.step) {
+        let report = match self.plan.timing.is_due(context.step) {
             true => Some(state.refine(self.refinement(context))?),
             false => None,
         };
         let strength = context.means_lr * self.section.noise;
         state.add_noise(NoiseUpdate { strength, seed: context.seed, step: context.step })?;
-        Ok(report)
+        self.sweeps.after(state, context.step, report)
     }
 }
 
@@ -109,13 +90,13 @@ mod tests {
     fn short_runs_refine_more_often_and_reach_the_cap_by_mid_run() {
         let section = DensifySection { cap: 60_000, ..DensifySection::default() };
         let plan = Plan::new(&section, 30_000, 13_302);
-        assert_eq!((plan.start, plan.stop, plan.every), (500, 25_000, 100));
+        assert_eq!(plan.timing, Timing { start: 500, stop: 25_000, every: 100 });
         assert!((plan.growth - 1.05).abs() < 1e-6);
         for steps in [100, 300, 3000] {
             let plan = Plan::new(&section, steps, 13_302);
             let mut n = 13_302.0;
             for step in 1..=steps / 2 {
-                if plan.is_due(step) {
+                if plan.timing.is_due(step) {
                     n *= f64::from(plan.growth);
                 }
             }

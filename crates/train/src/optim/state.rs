@@ -1,7 +1,10 @@
 //! A model in training: parameters and moments as tensors on one device, and how many updates they have seen.
 
 use super::{AdamSettings, Columns, LearningRates, Regularizers, ShRates};
-use crate::backend::{AdamUpdate, Changed, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State, Status};
+use crate::backend::{
+    AdamUpdate, Changed, Densification, MissedUpdates, NoiseUpdate, OptimOps, Refinement, State, Status,
+};
+use crate::densify::Bounds;
 use crate::error::Result;
 use crate::event::DensifyReport;
 use crate::kernels::cpu::rows::Rows;
@@ -279,6 +282,25 @@ impl ModelState {
     pub fn refine(&mut self, refinement: Refinement) -> Result<DensifyReport> {
         self.catch_up()?;
         self.apply(|state, shared| <Dispatch as OptimOps>::refine(state, refinement, shared))
+    }
+
+    /// Clones, splits and removes rows by the mean of `statistic`, `[N, 2]`: sum and number of views (3DGS, Sec. 5.2).
+    ///
+    /// # Errors
+    /// As [`ModelState::refine`].
+    pub fn densify(&mut self, statistic: Tensor<2>, densification: Densification) -> Result<DensifyReport> {
+        self.catch_up()?;
+        let statistic = statistic.into_dispatch();
+        self.apply(|state, shared| <Dispatch as OptimOps>::densify(state, statistic, densification, shared))
+    }
+
+    /// Removes the rows beyond `bounds`, unless all are.
+    ///
+    /// # Errors
+    /// As [`ModelState::refine`].
+    pub fn sweep(&mut self, bounds: Bounds) -> Result<DensifyReport> {
+        self.catch_up()?;
+        self.apply(|state, shared| <Dispatch as OptimOps>::sweep(state, bounds, shared))
     }
 
     /// Orders the rows along a Morton curve through the cube of `half` world units around `center`.

@@ -3,6 +3,7 @@
 
 use super::*;
 use crate::config::OptimSection;
+use crate::event::BrokenCounts;
 use crate::optim::Group;
 use gazesplat_render::{cpu_device, device::gpu_device};
 use gazesplat_testkit::{Rng, devices::required_gpu};
@@ -60,9 +61,7 @@ fn refinement(cap: usize) -> Refinement {
         growth: 1.05,
         cap,
         min_opacity: 0.005,
-        center: [0.0; 3],
-        max_log_scale: 1000f32.ln(),
-        max_distance: 1e5,
+        bounds: Bounds { center: [0.0; 3], max_log_scale: 1000f32.ln(), max_distance: 1e5 },
     }
 }
 
@@ -239,7 +238,7 @@ fn broken_gaussians_are_replaced_and_counted() {
         broken.row_mut(Group::OpacityLogits, 8)[0] = f32::INFINITY;
         let mut state = model(&broken, &device);
         let report = refine(&mut state, 10);
-        assert_eq!((report.num_relocated, report.num_relocated_broken), (0, 4));
+        assert_eq!((report.num_relocated, report.broken), (0, BrokenCounts { non_finite: 2, huge: 1, far: 1 }));
         assert!(params(&state).data.iter().flatten().all(|v| v.is_finite()));
     }
 }

@@ -281,7 +281,7 @@ impl Pruner {
     /// When the device does not answer.
     pub fn result(&self) -> Result<GaussianCloud> {
         match &self.best {
-            Some((snapshot, _)) => self.trainer.exported(&snapshot.splats()?),
+            Some((snapshot, _)) => Ok(self.trainer.exported(&snapshot.splats()?)?.cloud),
             None => self.trainer.to_cloud(),
         }
     }
@@ -556,7 +556,7 @@ fn trainer(job: &Job<'_>, cloud: &GaussianCloud, steps: u32, is_reference: bool)
     if is_reference {
         config.optim.means_lr = config.optim.means_lr_end;
     }
-    Trainer::from_cloud(cloud, job.dataset, Arc::clone(&job.images), &config, job.device)
+    Ok(Trainer::from_cloud(cloud, job.dataset, Arc::clone(&job.images), &config, job.device)?.keeping_rows())
 }
 
 /// Rows of `splats` that stay when the share `keep` of them is kept in one shot, ascending: how criteria are compared.

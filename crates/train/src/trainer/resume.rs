@@ -1,12 +1,14 @@
 //! Checkpoints of a trainer: what of a run is no function of its seed and step.
 //!
 //! That is the model with its moments, the step, when the rows were last sorted, with how many Gaussians the run began, and
-//! the corrections of the poses. Views, backgrounds, noise and draws are counter-based, so on a CPU a resumed run ends in the same bytes.
+//! the corrections of the poses, and what its strategy has seen and done since. Views, backgrounds, noise and draws are
+//! counter-based, so on a CPU a resumed run ends in the same bytes.
 
 use super::{Trainer, check_scene};
 use crate::checkpoint::{self, differences, fingerprint_of_cameras};
 use crate::config::Config;
 use crate::error::{Error, Result};
+use crate::event::DensifyReport;
 use crate::optim::{AdamSettings, ModelState};
 use crate::poses::ViewPose;
 use burn::tensor::Device;
@@ -19,6 +21,8 @@ use std::sync::Arc;
 
 /// Kind of run, as checkpoints name it.
 const KIND: &str = "train";
+/// The vector of what the strategy knows.
+const MEMORY: &str = "densify";
 /// Settings that change nothing of the model.
 const FREE: &[&str] = &["train.threads", "train.checkpoint_every", "train.checkpoint_keep", "data.cache_bytes"];
 
@@ -35,6 +39,7 @@ struct Record<N> {
     /// Corrections of the poses, if they are refined.
     #[serde(default)]
     poses: Option<Vec<ViewPose>>,
+    totals: DensifyReport,
     noted: N,
 }
 
@@ -66,10 +71,13 @@ impl Trainer {
             sorted_at: self.sorted_at,
             num_initial: self.num_initial,
             poses: self.recorded_poses(),
+            totals: self.totals,
             noted,
         };
         let state = self.state.snapshot()?.to_host()?;
-        checkpoint::save(path, KIND, &record, &[("state", &state)])
+        let memory = self.strategy.memory()?;
+        let vectors: Vec<(&str, &[f32])> = memory.iter().map(|values| (MEMORY, values.as_slice())).collect();
+        checkpoint::save_with(path, KIND, &record, &[("state", &state)], &vectors)
     }
 
     /// Takes up the run that left the checkpoint at `path`, and returns what its caller had noted. Terms that were added
@@ -89,7 +97,9 @@ impl Trainer {
         let mut loaded: checkpoint::Loaded<Record<N>> = checkpoint::load(path, KIND, &["state"])?;
         let refuse = |message: String| Error::Checkpoint { path: path.to_owned(), message };
         let state = loaded.take("state").ok_or_else(|| refuse("damaged: the model is missing".to_owned()))?;
-        let Record { version, config: recorded, origin, step, sorted_at, num_initial, poses, noted } = loaded.meta;
+        let memory = loaded.take_vector(MEMORY);
+        let Record { version, config: recorded, origin, step, sorted_at, num_initial, poses, totals, noted } =
+            loaded.meta;
         let current = env!("CARGO_PKG_VERSION");
         if version != current {
             return Err(refuse(format!("it is of version {version}, this is {current}")));
@@ -110,7 +120,12 @@ impl Trainer {
         if !trainer.restore_poses(poses) {
             return Err(refuse("damaged: its camera poses are not those of its views".to_owned()));
         }
-        (trainer.step, trainer.sorted_at) = (step, sorted_at);
+        if let Some(memory) = memory
+            && !trainer.strategy.remember(memory, trainer.state.num_rows(), device)
+        {
+            return Err(refuse("damaged: the statistic of densification does not fit the model".to_owned()));
+        }
+        (trainer.step, trainer.sorted_at, trainer.totals) = (step, sorted_at, totals);
         Ok((trainer, noted))
     }
 
@@ -127,6 +142,7 @@ impl Trainer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::StrategyKind;
     use gazesplat_core::synthetic::{SynthOptions, write_scene};
     use gazesplat_render::{cpu_device, device::gpu_device};
     use gazesplat_testkit::devices::required_gpu;
@@ -173,10 +189,31 @@ mod tests {
         (trainer.state.snapshot().and_then(|s| s.to_host()).expect("readable"), trainer.sorted_at)
     }
 
+    /// A run of ADC in which everything happens as often as in one of MCMC: refinements to five sixths of it, and opacity
+    /// resets, which leave some rows to remove.
+    fn adc(absolute_gradients: bool) -> Config {
+        let mut config = config();
+        config.densify.strategy = StrategyKind::Adc;
+        config.densify.absolute_gradients = absolute_gradients;
+        (config.densify.stop, config.densify.reset_every) = (Some(5.0 / 6.0), 130);
+        config
+    }
+
     #[test]
     fn interrupted_runs_end_in_the_bytes_of_the_uninterrupted_one() {
+        interrupted_everywhere(&config());
+    }
+
+    #[test]
+    fn interrupted_runs_of_adc_end_in_the_bytes_of_the_uninterrupted_one() {
+        for absolute_gradients in [false, true] {
+            interrupted_everywhere(&adc(absolute_gradients));
+        }
+    }
+
+    fn interrupted_everywhere(config: &Config) {
         let (dir, dataset) = scene(7);
-        let (config, device) = (config(), cpu_device());
+        let (config, device) = (config.clone(), cpu_device());
         let fresh = || Trainer::new(&dataset, images(&dataset), &config, &device).expect("valid");
         // Where something changes: the stop falls before, at and after it.
         let (mut watched, mut stops) = (fresh(), vec![0, 1]);
@@ -199,6 +236,7 @@ mod tests {
         stops.retain(|&stop| stop < NUM_STEPS);
         stops.sort_unstable();
         stops.dedup();
+        let totals = watched.totals;
         let expected = end(watched);
         let path = dir.path().join("checkpoint");
         // One run that is interrupted at all of them, each time taken up from the file.
@@ -210,8 +248,11 @@ mod tests {
             trainer.save(&path, &format!("at {stop}")).expect("writable");
             let (again, noted) = resumed(&dataset, &config, &device, &path).expect("valid");
             assert_eq!((again.step, again.sorted_at, noted), (stop, trainer.sorted_at, format!("at {stop}")));
+            assert_eq!(again.totals, trainer.totals);
             trainer = again;
         }
+        let is_adc = config.densify.strategy == StrategyKind::Adc;
+        assert_eq!((totals.num_split > 0, totals.num_opacity_resets > 1), (is_adc, is_adc), "{totals:?}");
         assert!(end(trainer) == expected);
     }
 
@@ -306,9 +347,14 @@ mod tests {
     /// The device repeats its bits from run to run, so that the tolerance is none.
     #[test]
     fn a_gpu_goes_on_as_if_nothing_had_happened() {
+        for config in [config(), adc(false)] {
+            interrupted_on_a_gpu(config);
+        }
+    }
+
+    fn interrupted_on_a_gpu(mut config: Config) {
         let Some(device) = required_gpu(gpu_device(None)) else { return };
         let (dir, dataset) = scene(5);
-        let mut config = config();
         config.train.steps = 40;
         let path = dir.path().join("checkpoint");
         let mut trainer = Trainer::new(&dataset, images(&dataset), &config, &device).expect("valid");
@@ -341,6 +387,10 @@ mod tests {
         (other.train.seed, other.densify.noise) = (4, 1.5);
         let said = refused(&dataset, &other);
         assert!(said.contains("train.seed = 0, now 4") && said.contains("densify.noise = "), "{said}");
+        let mut longer = adc(false);
+        longer.densify.strategy = StrategyKind::Mcmc;
+        let said = refused(&dataset, &longer);
+        assert!(said.contains("densify.stop = null, now 0.8333"), "{said}");
         let mut faster = config.clone();
         (faster.train.threads, faster.train.checkpoint_every, faster.data.cache_bytes) = (3, 7, 1 << 20);
         resumed(&dataset, &faster, &device, &path).expect("the model does not depend on these");

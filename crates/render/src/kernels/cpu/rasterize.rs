@@ -38,6 +38,8 @@ pub struct RasterOptions {
     pub depth: bool,
     /// Cut at α = 1/255 smoothed to C¹, for finite differences.
     pub smooth_cutoff: bool,
+    /// Whether the gradient of a probed frame has the sums of per-pixel magnitudes (Ye 2024).
+    pub absolute_gradients: bool,
 }
 
 impl RasterOptions {

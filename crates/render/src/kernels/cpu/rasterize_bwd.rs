@@ -40,7 +40,7 @@ const EMPTY: PixelRow = PixelRow {
 /// Gradients of all pairs, in list order: `[P]`.
 ///
 /// `v_image`: upstream gradient `[H, W, 4 or 5]`; `raster` as kept by the forward pass. `absolute` also fills the sums
-/// of per-pixel magnitudes (Ye 2024).
+/// of per-pixel magnitudes (Ye 2024), if the options ask for them.
 pub fn rasterize_bwd(
     splats: &[[f32; lane::COUNT]],
     lists: &TileLists<'_>,
@@ -55,7 +55,7 @@ pub fn rasterize_bwd(
     let ends = (1..=lists.grid.tiles_y as usize).map(|r| lists.tile_offsets[r * tiles_x] as usize);
     super::bin::split_at_offsets(&mut by_list, ends).into_par_iter().enumerate().for_each(|(tile_y, records)| {
         let strip = Strip { splats, lists, options, raster, v_image, tile_y, records };
-        match (options.depth, options.smooth_cutoff, absolute) {
+        match (options.depth, options.smooth_cutoff, absolute && options.absolute_gradients) {
             (false, false, false) => dispatch(BackwardStrip::<false, false, false>(strip)),
             (true, false, false) => dispatch(BackwardStrip::<true, false, false>(strip)),
             (false, true, false) => dispatch(BackwardStrip::<false, true, false>(strip)),

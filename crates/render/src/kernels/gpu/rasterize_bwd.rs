@@ -40,7 +40,7 @@ const _: () = assert!(
 /// Gradients of all pairs, by record: `[P, 12]`, lanes as in [`grad_lane`].
 ///
 /// `v_image`: upstream gradient `[H, W, 4 or 5]`; `raster` as kept by the forward pass. `absolute` also fills the sums of
-/// per-pixel magnitudes (Ye 2024).
+/// per-pixel magnitudes (Ye 2024), if the options ask for them.
 ///
 /// # Errors
 /// [`crate::Error::Limit`] when a buffer is larger than the adapter takes.
@@ -68,7 +68,7 @@ pub fn rasterize_bwd(
             tile_args(&lists.grid, options),
             options.depth,
             options.smooth_cutoff,
-            absolute,
+            absolute && options.absolute_gradients,
         );
     }
     Ok(records)

@@ -1,6 +1,7 @@
 //! The kernels of training on the CPU: slices in, slices out.
 
 pub mod adam;
+pub mod densify;
 pub mod l1_ssim;
 pub mod noise;
 pub mod regularize;
@@ -8,3 +9,4 @@ pub mod relocate;
 pub mod rows;
 pub mod scale_decay;
 pub mod seen;
+pub mod sweep;

@@ -7,32 +7,30 @@
 //! number of the copy only.
 
 use super::rows::Rows;
+use super::sweep::broken;
 use crate::backend::Refinement;
+use crate::densify::Broken;
 use crate::densify::relocation::{MAX_PARTS, RelocationTable};
-use crate::event::DensifyReport;
+use crate::event::{BrokenCounts, DensifyReport};
 use crate::optim::{Columns, Group};
 use crate::rng::{Stream, draw, uniform_f64};
 use rayon::prelude::*;
 
-/// Weights of the rows as sources (their opacities, 0 for dead ones), the dead rows, and how many of those are broken.
-fn survey(params: &Columns, refinement: &Refinement) -> (Vec<f64>, Vec<usize>, usize) {
-    let &Refinement { max_log_scale, max_distance, center, min_opacity, .. } = refinement;
-    let states: Vec<(f64, bool)> = (0..params.num_rows())
+/// Weights of the rows as sources (their opacities, 0 for dead ones), the dead rows, and what is wrong with the broken ones.
+fn survey(params: &Columns, refinement: &Refinement) -> (Vec<f64>, Vec<usize>, BrokenCounts) {
+    let states: Vec<(f64, Option<Broken>)> = (0..params.num_rows())
         .into_par_iter()
         .map(|i| {
-            let finite = Group::ALL.into_iter().all(|g| params.row(g, i).iter().all(|v| v.is_finite()));
-            let large = params.row(Group::LogScales, i).iter().any(|s| *s > max_log_scale);
-            let far = params.row(Group::Means, i).iter().zip(center).any(|(x, c)| (x - c).abs() > max_distance);
-            if !finite || large || far {
-                return (0.0, true);
+            if let Some(reason) = broken(params, i, &refinement.bounds) {
+                return (0.0, Some(reason));
             }
             let opacity = sigmoid(f64::from(params.of(Group::OpacityLogits)[i]));
-            (if opacity <= f64::from(min_opacity) { 0.0 } else { opacity }, false)
+            (if opacity <= f64::from(refinement.min_opacity) { 0.0 } else { opacity }, None)
         })
         .collect();
     let dead = (0..states.len()).filter(|&i| states[i].0 == 0.0).collect();
-    let num_broken = states.iter().filter(|s| s.1).count();
-    (states.into_iter().map(|s| s.0).collect(), dead, num_broken)
+    let broken = states.iter().filter_map(|s| s.1).collect();
+    (states.into_iter().map(|s| s.0).collect(), dead, broken)
 }
 
 /// `count` rows drawn by weight, and the division of the drawn ones done: each keeps its place with the opacity and
@@ -81,7 +79,7 @@ fn draw_sources(
 
 /// Moves the dead rows onto live ones, then adds rows.
 pub fn refine(rows: &mut Rows, refinement: &Refinement) -> DensifyReport {
-    let (weights, dead, num_broken) = survey(&rows.params, refinement);
+    let (weights, dead, broken) = survey(&rows.params, refinement);
     let sources = draw_sources(rows, &weights, dead.len(), refinement, 0);
     for (&target, &source) in dead.iter().zip(&sources) {
         rows.replace(target, source);
@@ -94,12 +92,14 @@ pub fn refine(rows: &mut Rows, refinement: &Refinement) -> DensifyReport {
         rows.append_copies(&sources);
         num_appended = sources.len();
     }
-    let moved = sources.len().min(dead.len());
+    // Either every dead row was moved, or there was no source and none was.
+    let broken = if sources.is_empty() { BrokenCounts::default() } else { broken };
     DensifyReport {
-        num_relocated: moved.saturating_sub(num_broken),
-        num_relocated_broken: num_broken.min(moved),
+        num_relocated: sources.len() - broken.total(),
+        broken,
         num_added: num_appended,
         num_gaussians: rows.num_rows(),
+        ..DensifyReport::default()
     }
 }
 
@@ -110,6 +110,7 @@ fn sigmoid(x: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::densify::Bounds;
 
     fn rows(opacities: &[f32]) -> Rows {
         let n = opacities.len();
@@ -126,9 +127,7 @@ mod tests {
             growth: 1.05,
             cap,
             min_opacity: 0.005,
-            center: [0.0; 3],
-            max_log_scale: 1000f32.ln(),
-            max_distance: 1e5,
+            bounds: Bounds { center: [0.0; 3], max_log_scale: 1000f32.ln(), max_distance: 1e5 },
         }
     }
 
@@ -165,7 +164,7 @@ mod tests {
         rows.params.row_mut(Group::LogScales, 4)[0] = 40.0;
         rows.params.row_mut(Group::Means, 6)[2] = 1e7;
         let report = refine(&mut rows, &refinement(10));
-        assert_eq!((report.num_relocated, report.num_relocated_broken), (0, 3));
+        assert_eq!((report.num_relocated, report.broken), (0, BrokenCounts { non_finite: 1, huge: 1, far: 1 }));
         assert!(rows.params.data.iter().flatten().all(|v| v.is_finite()));
     }
 

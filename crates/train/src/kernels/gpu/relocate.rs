@@ -8,12 +8,13 @@
 //!
 //! Weights are whole numbers whose sum fits 32 bits, so that prefix sums are exact and draws do not depend on the order
 //! of additions: a Gaussian on the threshold of death among a million has a weight of some twenty, one of three hundred
-//! thousand of some seventy. One read-back of four words tells the host how many rows are dead.
+//! thousand of some seventy. One read-back of six words tells the host how many rows are dead.
 
-use super::rows::{Listed, Sections, SectionsLaunch, copy_row, select_rows, zero_row};
+use super::rows::{Listed, PackedRows, Sections, SectionsLaunch, copy_row, select_rows, zero_row};
+use super::sweep::{BoundsArgs, BoundsArgsLaunch, NUM_REASONS, broken, broken_counts};
 use crate::backend::Refinement;
 use crate::densify::relocation::MAX_PARTS;
-use crate::event::DensifyReport;
+use crate::event::{BrokenCounts, DensifyReport};
 use crate::math::{logit_of_depth, opacity_of_depth, optical_depth, scale_of_parts};
 use crate::rng::Stream;
 use crate::rng::gpu::{Draws, DrawsLaunch, draw};
@@ -21,7 +22,6 @@ use burn::tensor::DType;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::prelude::*;
 use gazesplat_render::Result;
-use gazesplat_render::gpu::device_fn::is_finite;
 use gazesplat_render::gpu::{Gpu, cube_dim, packed::PackedLayout};
 use gazesplat_render::kernels::gpu::scan::exclusive_scan;
 
@@ -29,19 +29,6 @@ use gazesplat_render::kernels::gpu::scan::exclusive_scan;
 const MAX_WEIGHT: u32 = 1 << 24;
 /// ln((1 − 1e-6) / 1e-6): the largest logit of a part, as on the CPU.
 const MAX_LOGIT: f32 = 13.815_51;
-
-/// Packed parameters and moments of one layout.
-#[derive(Debug, Clone)]
-pub struct PackedRows {
-    /// Where the groups lie.
-    pub layout: PackedLayout,
-    /// The parameters.
-    pub params: CubeTensor,
-    /// First moments.
-    pub first: CubeTensor,
-    /// Second moments.
-    pub second: CubeTensor,
-}
 
 /// The rows as sources and as what is to be replaced.
 struct Survey {
@@ -51,18 +38,18 @@ struct Survey {
     is_dead: CubeTensor,
     /// Dead rows before each row, `[N + 1]`.
     dead_before: CubeTensor,
-    /// Broken rows before each row, `[N + 1]`.
-    broken_before: CubeTensor,
+    /// Broken rows by reason, `[3]`.
+    broken: CubeTensor,
 }
 
-/// Weights of the rows as sources (their opacities, 0 for dead ones), the dead rows, and how many of those are broken.
+/// Weights of the rows as sources (their opacities, 0 for dead ones), the dead rows, and what is wrong with the broken ones.
 fn survey(gpu: &Gpu, rows: &PackedRows, refinement: &Refinement) -> Result<Survey> {
     let n = rows.layout.num_rows;
-    let [weights, is_dead, is_broken] = [0; 3].map(|_| gpu.empty("bytes of a survey", &[n], DType::U32));
-    let (weights, is_dead, is_broken) = (weights?, is_dead?, is_broken?);
+    let [weights, is_dead] = [0; 2].map(|_| gpu.empty("bytes of a survey", &[n], DType::U32));
+    let (weights, is_dead) = (weights?, is_dead?);
+    let broken = gpu.zeros("bytes of counts", &[NUM_REASONS], DType::U32)?;
     // No row weighs more than this, so that the sum fits 32 bits.
     let scale = (u32::MAX / n as u32).min(MAX_WEIGHT);
-    let [x, y, z] = refinement.center;
     weigh_rows::launch(
         &gpu.client,
         gpu.units(n),
@@ -70,22 +57,16 @@ fn survey(gpu: &Gpu, rows: &PackedRows, refinement: &Refinement) -> Result<Surve
         rows.params.clone().into_buffer_arg(),
         weights.clone().into_buffer_arg(),
         is_dead.clone().into_buffer_arg(),
-        is_broken.clone().into_buffer_arg(),
+        broken.clone().into_buffer_arg(),
         SectionsLaunch::of(&rows.layout),
-        LimitsLaunch::new(
-            x,
-            y,
-            z,
-            refinement.max_distance,
-            refinement.max_log_scale,
-            refinement.min_opacity,
-            scale as f32,
-        ),
+        BoundsArgsLaunch::of(&refinement.bounds),
+        refinement.min_opacity,
+        scale as f32,
     );
     Ok(Survey {
         weights_before: exclusive_scan(gpu, &weights, n)?,
         dead_before: exclusive_scan(gpu, &is_dead, n)?,
-        broken_before: exclusive_scan(gpu, &is_broken, n)?,
+        broken,
         is_dead,
     })
 }
@@ -151,11 +132,11 @@ pub fn refine(
     gpu.check_size("bytes of packed parameters", &[grown.len()], DType::F32)?;
     // 1. Who is dead, and who can be a source.
     let found = survey(gpu, &rows, refinement)?;
-    let [total, num_dead, num_broken, failed] = read_totals(gpu, &found, status, n)?;
+    let ([total, num_dead, failed], broken) = read_totals(gpu, &found, status, n)?;
     if total == 0 || failed > 0 {
         return Ok((rows, untouched));
     }
-    let (num_dead, num_broken) = (num_dead as usize, num_broken as usize);
+    let num_dead = num_dead as usize;
     // 2. Relocation.
     if num_dead > 0 {
         let sources = draw_sources(gpu, &rows, &found.weights_before, num_dead, refinement, 0)?;
@@ -187,43 +168,30 @@ pub fn refine(
         rows
     };
     let report = DensifyReport {
-        num_relocated: num_dead - num_broken,
-        num_relocated_broken: num_broken,
+        num_relocated: num_dead - broken.total(),
+        broken,
         num_added,
         num_gaussians: rows.layout.num_rows,
+        ..DensifyReport::default()
     };
     Ok((rows, report))
 }
 
-/// Sum of the weights, dead rows, broken rows, and the first word of the status.
-fn read_totals(gpu: &Gpu, found: &Survey, status: &CubeTensor, n: usize) -> Result<[u32; 4]> {
-    let totals = gpu.empty("bytes of counts", &[4], DType::U32)?;
+/// Sum of the weights, dead rows and the first word of the status; the broken rows.
+fn read_totals(gpu: &Gpu, found: &Survey, status: &CubeTensor, n: usize) -> Result<([u32; 3], BrokenCounts)> {
+    let totals = gpu.empty("bytes of counts", &[3], DType::U32)?;
     gather_totals::launch(
         &gpu.client,
         gpu.cubes(1),
         cube_dim(),
         found.weights_before.clone().into_buffer_arg(),
         found.dead_before.clone().into_buffer_arg(),
-        found.broken_before.clone().into_buffer_arg(),
         status.clone().into_buffer_arg(),
         totals.clone().into_buffer_arg(),
         n as u32,
     );
-    let words = gpu.read_u32(&totals)?;
-    Ok(std::array::from_fn(|i| words[i]))
-}
-
-/// What a living row may not exceed.
-#[derive(CubeType, CubeLaunch, Clone, Copy)]
-pub struct Limits {
-    pub center_x: f32,
-    pub center_y: f32,
-    pub center_z: f32,
-    pub max_distance: f32,
-    pub max_log_scale: f32,
-    pub min_opacity: f32,
-    /// Weight of an opacity of 1.
-    pub weight: f32,
+    let [totals, broken] = gpu.read_all_u32([&totals, &found.broken])?;
+    Ok((std::array::from_fn(|i| totals[i]), broken_counts(&broken)))
 }
 
 #[cube(launch)]
@@ -231,37 +199,23 @@ fn weigh_rows(
     params: &[f32],
     weights: &mut [u32],
     is_dead: &mut [u32],
-    is_broken: &mut [u32],
+    num_broken: &mut [Atomic<u32>],
     at: Sections,
-    limits: Limits,
+    bounds: BoundsArgs,
+    min_opacity: f32,
+    whole: f32,
 ) {
     let row = ABSOLUTE_POS;
     if row < at.num_rows as usize {
-        let mut ok = true;
-        for i in 0..3usize {
-            let mean = params[3 * row + i];
-            let log_scale = params[at.log_scales as usize + 3 * row + i];
-            ok = ok && is_finite(mean) && is_finite(log_scale) && log_scale <= limits.max_log_scale;
-        }
-        ok = ok && f32::abs(params[3 * row] - limits.center_x) <= limits.max_distance;
-        ok = ok && f32::abs(params[3 * row + 1] - limits.center_y) <= limits.max_distance;
-        ok = ok && f32::abs(params[3 * row + 2] - limits.center_z) <= limits.max_distance;
-        for i in 0..4usize {
-            ok = ok && is_finite(params[at.quats as usize + 4 * row + i]);
-        }
-        let sh = at.sh as usize + row * at.sh_width as usize;
-        for i in 0..at.sh_width as usize {
-            ok = ok && is_finite(params[sh + i]);
-        }
-        let logit = params[at.opacity_logits as usize + row];
-        ok = ok && is_finite(logit);
+        let reason = broken(params, &at, &bounds, row);
         let mut weight = 0u32;
-        let mut broken = 1u32;
-        if ok {
-            broken = 0u32;
-            let opacity = 1.0f32 / (1.0f32 + f32::exp(-logit));
-            if opacity > limits.min_opacity {
-                weight = u32::max(1u32, (opacity * limits.weight) as u32);
+        if reason > 0u32 {
+            num_broken[reason as usize - 1].fetch_add(1u32);
+        } else {
+            let opacity = 1.0f32 / (1.0f32 + f32::exp(-params[at.opacity_logits as usize + row]));
+            if opacity > min_opacity {
+                // `whole` is the weight of an opacity of 1.
+                weight = u32::max(1u32, (opacity * whole) as u32);
             }
         }
         let mut dead = 0u32;
@@ -270,24 +224,15 @@ fn weigh_rows(
         }
         weights[row] = weight;
         is_dead[row] = dead;
-        is_broken[row] = broken;
     }
 }
 
 #[cube(launch)]
-fn gather_totals(
-    weights_before: &[u32],
-    dead_before: &[u32],
-    broken_before: &[u32],
-    status: &[u32],
-    totals: &mut [u32],
-    num_rows: u32,
-) {
+fn gather_totals(weights_before: &[u32], dead_before: &[u32], status: &[u32], totals: &mut [u32], num_rows: u32) {
     if ABSOLUTE_POS == 0 {
         totals[0] = weights_before[num_rows as usize];
         totals[1] = dead_before[num_rows as usize];
-        totals[2] = broken_before[num_rows as usize];
-        totals[3] = status[0];
+        totals[2] = status[0];
     }
 }
 

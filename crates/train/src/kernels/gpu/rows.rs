@@ -68,6 +68,35 @@ pub fn morton_order(
     Ok(radix_sort(gpu, keys, rows, n, &count, 0, 3 * MORTON_BITS)?.1)
 }
 
+/// Packed parameters and moments of one layout.
+#[derive(Debug, Clone)]
+pub struct PackedRows {
+    /// Where the groups lie.
+    pub layout: PackedLayout,
+    /// The parameters.
+    pub params: CubeTensor,
+    /// First moments.
+    pub first: CubeTensor,
+    /// Second moments.
+    pub second: CubeTensor,
+}
+
+impl PackedRows {
+    /// All three buffers, each with the rows of `new` that `listed` says.
+    ///
+    /// # Errors
+    /// As [`select_rows`].
+    pub fn selected(&self, gpu: &Gpu, new: PackedLayout, list: &CubeTensor, listed: Listed) -> Result<Self> {
+        let select = |from: &CubeTensor| select_rows(gpu, &self.layout, from.clone(), &new, list, listed);
+        Ok(Self {
+            params: select(&self.params)?,
+            first: select(&self.first)?,
+            second: select(&self.second)?,
+            layout: new,
+        })
+    }
+}
+
 /// Which rows a result is made of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Listed {

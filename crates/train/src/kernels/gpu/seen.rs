@@ -5,7 +5,7 @@
 //! nothing is done while the status is closed. NaN stays in its value; an empty model is never handed over.
 
 use super::adam::{Constants, ConstantsLaunch, flushed};
-use super::relocate::PackedRows;
+use super::rows::PackedRows;
 use super::rows::{Sections, SectionsLaunch};
 use crate::backend::{AdamUpdate, MissedUpdates};
 use crate::kernels::cpu::adam::Step;

@@ -1,7 +1,8 @@
 //! Rows that lag against the dense optimiser, which does every update of every row.
 
 use super::*;
-use crate::backend::{NoiseUpdate, Refinement};
+use crate::backend::{Densification, NoiseUpdate, Refinement};
+use crate::densify::Bounds;
 use crate::optim::{AdamSettings, Columns, Group, HostState, LearningRates, Regularizers};
 use burn::tensor::{Device, Tensor};
 use gazesplat_core::Pinhole;
@@ -288,24 +289,36 @@ fn a_loss_that_is_no_number_changes_nothing_of_what_lags() {
     }
 }
 
+const BOUNDS: Bounds = Bounds { center: [0.0; 3], max_log_scale: 5.0, max_distance: 1e5 };
+
 #[test]
 fn every_operation_on_rows_finds_them_up_to_date() {
-    let operations: [(&str, fn(&mut ModelState)); 5] = [
+    let operations: [(&str, fn(&mut ModelState)); 7] = [
         ("sort", |state| state.sort_spatially([0.0; 3], 4.0).expect("it fits")),
         ("select", |state| state.select_rows((0..N as u32).rev().filter(|i| i % 5 > 0).collect()).expect("it fits")),
         ("widen", |state| state.widen_sh(9).expect("it fits")),
         ("refine", |state| {
-            let refinement = Refinement {
+            let refinement =
+                Refinement { seed: 3, step: 500, growth: 1.05, cap: 720, min_opacity: 0.005, bounds: BOUNDS };
+            assert_eq!(state.refine(refinement).expect("it fits").num_added, 20);
+        }),
+        ("densify", |state| {
+            let densification = Densification {
                 seed: 3,
                 step: 500,
-                growth: 1.05,
                 cap: 720,
-                min_opacity: 0.005,
-                center: [0.0; 3],
-                max_log_scale: 5.0,
-                max_distance: 1e5,
+                grow_gradient: 0.5,
+                max_clone_log_scale: 0.0,
+                min_logit: -20.0,
+                max_log_scale: None,
+                bounds: BOUNDS,
+                reset_logit: None,
             };
-            assert_eq!(state.refine(refinement).expect("it fits").num_added, 20);
+            let statistic = Tensor::<2>::ones([state.num_rows(), 2], state.device());
+            assert_eq!(state.densify(statistic, densification).expect("it fits").num_added, 20);
+        }),
+        ("sweep", |state| {
+            state.sweep(BOUNDS).expect("it fits");
         }),
         ("update", |state| update(state, &gradients(1, 0), 0.5)),
     ];

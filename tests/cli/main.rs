@@ -10,6 +10,7 @@ mod eval;
 mod help;
 mod hvsq;
 mod info;
+mod memory;
 mod prune;
 mod render;
 mod resume;

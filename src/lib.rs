@@ -10,6 +10,7 @@ pub mod console;
 pub mod diagnostics;
 pub mod interrupt;
 pub mod json_lines;
+pub mod memory;
 pub mod npy;
 pub mod progress;
 pub mod report;

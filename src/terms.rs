@@ -11,6 +11,7 @@ use gazesplat_train::Trainer;
 use gazesplat_train::losses::ImageLoss;
 use gazesplat_train::metrics::{Bound, Guard};
 use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 /// The section of [`TermSection`] that is registered as a loss, as in settings files.
@@ -22,6 +23,17 @@ pub const HVSQ_LOSS: &str = "loss.hvsq";
 pub struct TermSection {
     /// Terms of the loss.
     pub loss: LossTerms,
+    /// What is measured beside PSNR and SSIM.
+    pub eval: EvalTerms,
+}
+
+/// What is measured of test views beside PSNR, SSIM and FLIP.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EvalTerms {
+    /// A safetensors file with the weights of LPIPS over VGG16, which is then measured after training and by `eval`; unset =
+    /// it is not.
+    pub lpips_weights: Option<PathBuf>,
 }
 
 /// Terms of the loss by name.

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Settings of this program that change nothing of the model.
-const FREE: &[&str] = &["loss.hvsq.cache_mb"];
+const FREE: &[&str] = &["loss.hvsq.cache_mb", "eval.lpips_weights"];
 
 /// What this program finds again in a checkpoint.
 #[derive(Debug, Clone, Serialize, Deserialize)]

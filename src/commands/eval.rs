@@ -3,9 +3,10 @@
 use super::antialiased::AntialiasedArgs;
 use super::device::ComputeDevice;
 use super::hvsq_args::{self, HvsqArgs, Measured, Measures};
+use super::perceptual::Perceptual;
 use super::quality::{self, ImageFiles};
 use super::termination::TerminationArgs;
-use super::{Model, Split, load_scene, log_machine};
+use super::{Model, Split, layered, load_scene, log_machine};
 use crate::cli::{DeviceArgs, SettingsArgs};
 use crate::console::{Console, bytes, grouped};
 use crate::diagnostics::{Failure, Result};
@@ -30,6 +31,7 @@ Examples:
   gazesplat eval runs/fox-1 --scene fox --device gpu
   gazesplat eval runs/fox-1 --scene fox --antialiased --set data.max_side=240
   gazesplat eval runs/fox-1 --scene fox --hvsq 1,3,7,12 --gaze 0.5,0.5
+  gazesplat eval runs/fox-1 --scene fox --lpips-weights lpips_vgg.safetensors
 
 A run is measured with the settings it was trained with (image size, split, background,
 antialiasing), a PLY file with the defaults.
@@ -63,7 +65,11 @@ pub struct EvalArgs {
     /// Exit with status 1 when the mean PSNR is below this many dB
     #[arg(long, value_name = "DB")]
     pub min_psnr: Option<f64>,
-    /// Write the render of every view and a map of its errors below this directory: `renders`, `errors`
+    /// Measure LPIPS too, with the weights in this safetensors file (README.md says how to make it)
+    #[arg(long, value_name = "FILE")]
+    pub lpips_weights: Option<PathBuf>,
+    /// Write the render of every view, a map of its errors and one of FLIP (black 0 to pale yellow 1) below this
+    /// directory: `renders`, `errors`, `flip`
     #[arg(long, value_name = "DIR")]
     pub save_images: Option<PathBuf>,
     /// Write the JSON to this file too
@@ -83,8 +89,11 @@ pub fn command(args: &EvalArgs, console: &Console) -> Result<()> {
 
 fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()> {
     let model = Model::load_for_drawing(&args.model, console)?;
-    let mut config = model.settings(&args.settings)?;
+    let settings = layered(model.run_settings()?, &args.settings)?;
+    let (mut config, terms) = (settings.resolve()?, settings.resolve_terms()?);
     config.model.antialiased = args.antialiased.or(config.model.antialiased);
+    let weights = args.lpips_weights.as_ref().or(terms.eval.lpips_weights.as_ref());
+    let perceptual = Perceptual::new(weights.map(PathBuf::as_path), device)?;
     let dataset = load_scene(&args.scene, &config, console)?;
     let measures = args.hvsq.measures()?;
     let images = ImageCache::new(args.split.views(&dataset, &args.scene)?, config.data.cache_bytes);
@@ -94,7 +103,8 @@ fn eval(args: &EvalArgs, device: &ComputeDevice, console: &Console) -> Result<()
         let options = RenderOptions { termination: args.termination.termination()?, ..config.render_options() };
         device.guard(|| {
             let splats = Splats::from_cloud(&model.cloud, device.tensors())?;
-            measure(args, measures.as_ref(), files.as_ref(), &splats, &images, &options, console)
+            let each = Each { args, measures: measures.as_ref(), files: files.as_ref(), perceptual: &perceptual };
+            measure(each, &splats, &images, &options, console)
         })
     })??;
     let (report, hvsq) = report;
@@ -155,12 +165,18 @@ impl<'a> From<&'a HvsqOfViews> for HvsqReport<'a> {
 /// Every view by name, with what HVSQ says of it.
 type NamedMeasures = Vec<(String, Measured)>;
 
+/// What is done with each view.
+struct Each<'a> {
+    args: &'a EvalArgs,
+    measures: Option<&'a Measures>,
+    files: Option<&'a ImageFiles>,
+    perceptual: &'a Perceptual,
+}
+
 /// Measures every view in all ways that were asked for, keeps what was compared in `files`, and writes the map of the view
 /// that differs most in the last measure.
 fn measure(
-    args: &EvalArgs,
-    measures: Option<&Measures>,
-    files: Option<&ImageFiles>,
+    Each { args, measures, files, perceptual }: Each<'_>,
     splats: &Splats,
     images: &ImageCache,
     options: &RenderOptions,
@@ -174,7 +190,7 @@ fn measure(
         }
         let photo = images.get(index)?;
         if let Some(files) = files {
-            files.write(index, image, &photo, options)?;
+            files.write(index, image, &photo, options, &perceptual.flip)?;
         }
         if let Some(measures) = measures {
             let target = LossTarget::new(photo, options.background);
@@ -187,7 +203,7 @@ fn measure(
         }
         Ok(())
     };
-    let report = quality::measure_each(splats, images, options, &mut each, console)?;
+    let report = quality::measure_each(splats, images, options, &perceptual.metrics(), &mut each, console)?;
     if let (Some(measures), Some(path), Some((_, image, target))) = (measures, &args.hvsq.hvsq_map, &worst) {
         measures.write_map(path, image, target, console)?;
     }

@@ -10,8 +10,8 @@ use gazesplat_fovea::Hvsq;
 use gazesplat_fovea::hvs::pooling::{GazePooling, Pooling, level_pooling_px};
 use gazesplat_fovea::hvsq::{Distance, HvsqReference, ImageView};
 use gazesplat_train::losses::LossTarget;
+use gazesplat_train::metrics::unmasked;
 use serde::Serialize;
-use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 /// Eccentricities at which quality levels 1, 2 and 3 begin, degrees (RTGS Sec. 5.1).
@@ -197,21 +197,6 @@ impl Measures {
     }
 }
 
-/// The image with the photograph's colours where its mask leaves pixels out.
-fn unmasked<'a>(image: &'a ImageF32, target: &LossTarget) -> Cow<'a, ImageF32> {
-    let Some(mask) = target.mask().filter(|mask| 3 * mask.len() == image.data.len()) else {
-        return Cow::Borrowed(image);
-    };
-    let mut image = image.clone();
-    let pixels = image.data.chunks_exact_mut(3).zip(target.rgb().chunks_exact(3)).zip(mask);
-    for ((pixel, color), _) in pixels.filter(|(_, m)| **m == 0) {
-        for (v, c) in pixel.iter_mut().zip(color) {
-            *v = from_u8(*c);
-        }
-    }
-    Cow::Owned(image)
-}
-
 /// Means over views, as far as every view has a value.
 pub fn mean(views: &[(String, Measured)]) -> Measured {
     let Some((_, first)) = views.first() else { return Measured { hvsq: Vec::new() } };
@@ -259,6 +244,7 @@ fn view(image: &ImageF32) -> ImageView<'_, f32> {
 
 impl From<gazesplat_fovea::Error> for Failure {
     fn from(error: gazesplat_fovea::Error) -> Self {
-        Self::new(error.to_string()).hint("`gazesplat hvsq --help` says what each option takes")
+        let hint = error.hint().unwrap_or("`gazesplat hvsq --help` says what each option takes").to_owned();
+        Self::new(error.to_string()).hint(hint)
     }
 }

@@ -20,6 +20,7 @@ mod checkpoints;
 mod devices;
 mod frames;
 mod keeper;
+mod perceptual;
 mod quality;
 mod record;
 mod refined;

@@ -5,14 +5,19 @@ use crate::console::Console;
 use crate::diagnostics::Result;
 use crate::progress;
 use crate::report::ViewPanel;
-use crate::report::pictures::error_map;
+use crate::report::pictures::{error_map, heat};
 use crate::run_dir::create_all;
-use gazesplat_core::ImageF32;
 use gazesplat_core::io::images::{ImageCache, TrainingImage};
 use gazesplat_core::io::save_png;
+use gazesplat_core::{ImageF32, RgbImage8};
+use gazesplat_fovea::flip::FlipMetric;
 use gazesplat_render::{RenderOptions, Splats};
+use gazesplat_train::losses::LossTarget;
+use gazesplat_train::metrics::ImageMetric;
 use gazesplat_train::{EvalReport, ViewScore};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 /// Views shown with pictures, as ranks among all by PSNR from the worst (0) to the best (1): the typical one first.
 const PANEL_RANKS: [f64; 5] = [0.5, 0.0, 1.0, 0.25, 0.75];
@@ -24,10 +29,10 @@ pub(crate) fn measure(
     options: &RenderOptions,
     console: &Console,
 ) -> Result<EvalReport> {
-    measure_each(splats, images, options, &mut |_, _, _| Ok(()), console)
+    measure_each(splats, images, options, &[], &mut |_, _, _| Ok(()), console)
 }
 
-/// Measures every view of `images`; `each` gets its number, its score and its render, and is not called again after it has
+/// Measures every view of `images`, with further `metrics`; `each` gets its number, its score and its render, and is not called again after it has
 /// failed: a disk that refuses one file refuses the next.
 ///
 /// # Errors
@@ -36,12 +41,13 @@ pub(crate) fn measure_each(
     splats: &Splats,
     images: &ImageCache,
     options: &RenderOptions,
+    metrics: &[&dyn ImageMetric],
     each: &mut dyn FnMut(usize, &ViewScore, &ImageF32) -> Result<()>,
     console: &Console,
 ) -> Result<EvalReport> {
     let bar = progress::counting_bar(console, "measuring", images.len());
     let (mut index, mut done) = (0, Ok(()));
-    let report = gazesplat_train::evaluate(splats, images, options, &mut |score, render| {
+    let report = gazesplat_train::evaluate_with(splats, images, options, metrics, &mut |score, render| {
         if done.is_ok() {
             done = each(index, score, render);
         }
@@ -52,35 +58,42 @@ pub(crate) fn measure_each(
     done.map(|()| report)
 }
 
-/// Where renders and error maps of measured views go.
+/// Where renders, error maps and FLIP maps of measured views go.
 pub(crate) struct ImageFiles {
     renders: PathBuf,
     errors: PathBuf,
+    flips: PathBuf,
     names: Vec<String>,
 }
 
 impl ImageFiles {
-    /// Makes `dir/renders` and `dir/errors` for the views of `images`, before anything is measured.
+    /// Makes `dir/renders`, `dir/errors` and `dir/flip` for the views of `images`, before anything is measured.
     ///
     /// # Errors
     /// When a directory cannot be made, or two views would share a file.
     pub(crate) fn create(dir: &Path, images: &ImageCache) -> Result<Self> {
         let cameras: Vec<NamedCamera> = images.views().iter().map(|v| (v.name.clone(), v.camera)).collect();
         let names = frames::png_names(&cameras).map_err(|failure| failure.hint("rename one of the two images"))?;
-        let [renders, errors] = ["renders", "errors"].map(|name| dir.join(name));
-        create_all(&renders)?;
-        create_all(&errors)?;
-        Ok(Self { renders, errors, names })
+        let [renders, errors, flips] = ["renders", "errors", "flip"].map(|name| dir.join(name));
+        for made in [&renders, &errors, &flips] {
+            create_all(made)?;
+        }
+        Ok(Self { renders, errors, flips, names })
     }
 
-    /// Writes the render of view `index` and its difference to `photo`, dark where the mask leaves no loss.
+    /// Writes the render of view `index`, its difference to `photo`, and what FLIP says of it from 0 to 1; both maps are dark
+    /// where the mask leaves no loss.
     pub(crate) fn write(
         &self,
         index: usize,
         render: &ImageF32,
-        photo: &TrainingImage,
+        photo: &Arc<TrainingImage>,
         options: &RenderOptions,
+        flip: &FlipMetric,
     ) -> Result<()> {
+        let seen = flip.map(render, &LossTarget::new(Arc::clone(photo), options.background))?;
+        let data = seen.iter().flat_map(|&v| heat(v as f32)).collect();
+        let seen = RgbImage8 { width: render.width, height: render.height, data };
         let render = render.to_rgb8();
         let mut errors = error_map(&photo.composited(options.background), &render);
         if let Some(mask) = &photo.mask {
@@ -89,6 +102,7 @@ impl ImageFiles {
         }
         let name = &self.names[index];
         save_png(self.renders.join(name), &render)?;
+        save_png(self.flips.join(name), &seen)?;
         Ok(save_png(self.errors.join(name), &errors)?)
     }
 }
@@ -123,9 +137,13 @@ pub(crate) fn panels(
 /// The scores as a table for people.
 pub(crate) fn table(report: &EvalReport) -> String {
     let width = report.views.iter().map(|v| v.name.chars().count()).max().unwrap_or(0).max("mean".len());
-    let mut lines = vec![format!("{:width$}  {:>9}  {:>7}", "view", "PSNR", "SSIM")];
-    let row = |name: &str, psnr: f64, ssim: f64| format!("{name:width$}  {psnr:>6.2} dB  {ssim:>7.4}");
-    lines.extend(report.views.iter().map(|v| row(&v.name, v.psnr, v.ssim)));
-    lines.push(row("mean", report.psnr, report.ssim));
+    let names: String = report.more.keys().map(|name| format!("  {:>7}", name.to_uppercase())).collect();
+    let mut lines = vec![format!("{:width$}  {:>9}  {:>7}{names}", "view", "PSNR", "SSIM")];
+    let row = |name: &str, psnr: f64, ssim: f64, more: &BTreeMap<String, f64>| {
+        let more: String = more.values().map(|value| format!("  {value:>7.4}")).collect();
+        format!("{name:width$}  {psnr:>6.2} dB  {ssim:>7.4}{more}")
+    };
+    lines.extend(report.views.iter().map(|v| row(&v.name, v.psnr, v.ssim, &v.more)));
+    lines.push(row("mean", report.psnr, report.ssim, &report.more));
     lines.join("\n")
 }

@@ -1,11 +1,15 @@
 //! Keeps what happens during a training: every logged step into `metrics.jsonl`, the same for the report.
 
 use super::keeper::Follower;
+use crate::console::{bytes, grouped};
 use crate::json_lines::JsonLines;
+use crate::memory::peak_resident_bytes;
 use crate::report::StepPoint;
+use gazesplat_core::io::images::ImageCache;
 use gazesplat_train::{DensifyReport, EvalReport, Observer, StageMs, StepReport, TrainEvent};
 use serde::Serialize;
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// A stage's name and where its time is found.
 type Stage = (&'static str, fn(&StageMs) -> f32);
@@ -40,6 +44,9 @@ struct Record {
     densified: DensifyReport,
     /// Milliseconds of the step.
     step_ms: StepMs,
+    /// Memory when the line was written.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    memory: Option<MemoryFigures>,
     /// Quality on the test views, in the steps after which it was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
     test: Option<TestScore>,
@@ -64,6 +71,51 @@ struct TestScore {
     ssim: f64,
 }
 
+/// Where the memory of a run is looked up.
+#[derive(Debug, Clone)]
+pub(crate) struct Memory(pub Arc<ImageCache>);
+
+/// Memory of a run: what its images take, and what the process has taken at most.
+#[derive(Debug, Clone, Copy, Serialize)]
+struct MemoryFigures {
+    /// Bytes of decoded images that are held.
+    image_bytes: usize,
+    /// The most that were held and being decoded so far.
+    image_bytes_peak: usize,
+    /// Requests for images that were answered from memory.
+    image_hits: u64,
+    /// Images that were decoded.
+    image_misses: u64,
+    /// The most memory the process has had resident, bytes; `null` where the system does not tell.
+    peak_resident_bytes: Option<u64>,
+}
+
+impl Memory {
+    fn now(&self) -> MemoryFigures {
+        let stats = self.0.stats();
+        MemoryFigures {
+            image_bytes: stats.num_bytes,
+            image_bytes_peak: stats.peak_bytes,
+            image_hits: stats.num_hits,
+            image_misses: stats.num_misses,
+            peak_resident_bytes: peak_resident_bytes(),
+        }
+    }
+
+    /// The figures as a line for people.
+    pub(crate) fn figures(&self) -> String {
+        let MemoryFigures { image_bytes_peak, image_hits, image_misses, peak_resident_bytes, .. } = self.now();
+        let budget = bytes(self.0.stats().byte_budget as u64);
+        let peak = peak_resident_bytes.map_or_else(String::new, |peak| format!("at most {}, ", bytes(peak)));
+        format!(
+            "memory: {peak}images up to {} of {budget}, {} decoded, {} found in memory",
+            bytes(image_bytes_peak as u64),
+            grouped(image_misses as usize),
+            grouped(image_hits as usize)
+        )
+    }
+}
+
 /// The observer that remembers.
 #[derive(Debug)]
 pub(crate) struct Recorder {
@@ -77,7 +129,7 @@ pub(crate) struct Recorder {
     total_sum_ms: f64,
     /// Steps since the last line, and their milliseconds.
     unwritten: (u32, f64),
-    last_evaluation: Option<(u32, EvalReport)>,
+    memory: Option<Memory>,
     /// Logged steps.
     pub(crate) steps: Vec<StepPoint>,
     /// (step, dB) of every measurement on the way.
@@ -96,10 +148,15 @@ impl Recorder {
             stage_sum_ms: [0.0; NUM_STAGES],
             total_sum_ms: 0.0,
             unwritten: (0, 0.0),
-            last_evaluation: None,
+            memory: None,
             steps: Vec::new(),
             test_psnr: Vec::new(),
         }
+    }
+
+    /// Writes the figures of `memory` beside those of the steps.
+    pub(crate) fn watching(self, memory: Memory) -> Self {
+        Self { memory: Some(memory), ..self }
     }
 
     /// Remembers what stands in the log of a run that goes on: loss, Gaussians and quality; times are those of this part.
@@ -169,6 +226,7 @@ impl Recorder {
             num_gaussians: report.num_gaussians,
             densified: report.totals,
             step_ms,
+            memory: None,
             test: None,
             is_logged,
         });
@@ -177,22 +235,17 @@ impl Recorder {
 
     fn evaluated(&mut self, report: &EvalReport, step: u32) {
         self.test_psnr.push((step, report.psnr));
-        self.last_evaluation = Some((step, report.clone()));
         if let Some(record) = &mut self.pending {
             record.test = Some(TestScore { psnr: report.psnr, ssim: report.ssim });
         }
     }
 
-    /// What was measured after exactly `step` steps, if it was.
-    pub(crate) fn take_evaluation(&mut self, step: u32) -> Option<EvalReport> {
-        self.last_evaluation.take().filter(|(measured, _)| *measured == step).map(|(_, report)| report)
-    }
-
     /// Writes the latest step, if it is one to log.
     pub(crate) fn flush(&mut self) -> crate::Result<()> {
-        let Some(record) = self.pending.take() else { return Ok(()) };
+        let Some(mut record) = self.pending.take() else { return Ok(()) };
         if record.is_logged || record.test.is_some() {
             self.steps.push(StepPoint { step: record.step, loss: record.loss, num_gaussians: record.num_gaussians });
+            record.memory = self.memory.as_ref().map(Memory::now);
             self.log.append(&record)?;
             self.unwritten = (0, 0.0);
         }

@@ -5,7 +5,8 @@
 use super::checkpoints::{Checkpoints, Resumed};
 use super::device::ComputeDevice;
 use super::keeper::{Keeper, Kept};
-use super::record::Recorder;
+use super::perceptual::Perceptual;
+use super::record::{Memory, Recorder};
 use super::refined::Refined;
 use super::{Model, antialiased, layered, load_scene, log_machine, quality, scene_name};
 use crate::cli::{DeviceArgs, SettingsArgs};
@@ -168,6 +169,8 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         grouped(dataset.points.positions.len())
     ));
     let mut warnings = dataset.warnings.clone();
+    // Weights that cannot be read are found before the hours of training, not after them.
+    let perceptual = Perceptual::new(job.terms.eval.lpips_weights.as_deref(), job.device)?;
     let run_dir = match job.out {
         Some(out) if job.resume.is_some() => RunDir::open_interrupted(out)?,
         Some(out) => RunDir::create(out, job.overwrite)?,
@@ -175,6 +178,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     };
 
     let images = Arc::new(ImageCache::new(dataset.train.clone(), config.data.cache_bytes));
+    let memory = Memory(Arc::clone(&images));
     preload(&images, console)?;
     let mut saved = Checkpoints::new(&run_dir, config, beside(job), job.device.describe());
     let (mut trainer, earlier, cache) = job.device.guard(|| {
@@ -214,7 +218,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     }
     preload(&measured_images, console)?;
     tracing::info!(
-        "images in memory: {} training ({}), {} measured ({}), at most {} each",
+        "images in memory: {} training ({}), {} measured ({}), at most {} together",
         images.len(),
         bytes(images.num_bytes() as u64),
         measured_images.len(),
@@ -232,7 +236,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         Some(earlier) => earlier,
         None => (run_dir.start_metrics()?, Duration::ZERO),
     };
-    let mut recorder = Recorder::new(log, config.train.log_every, job.device.is_gpu());
+    let mut recorder = Recorder::new(log, config.train.log_every, job.device.is_gpu()).watching(memory.clone());
     if is_resumed {
         recorder.recall()?;
     }
@@ -287,16 +291,16 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     let started = Instant::now();
     let measured_images = match &refined {
         Some(refined) if measured == Measured::Training => {
-            Arc::new(ImageCache::new(refined.views.clone(), config.data.cache_bytes))
+            Arc::new(measured_images.beside(refined.views.clone()))
         }
         _ => measured_images,
     };
     let options = config.render_options();
-    // The run may just have measured this very model.
-    let known = recorder.take_evaluation(num_steps).filter(|eval| eval.num_gaussians == cloud.len());
     let (eval, views) = job.device.guard(|| {
         let splats = Splats::from_cloud(&cloud, job.device.tensors())?;
-        let eval = known.map_or_else(|| quality::measure(&splats, &measured_images, &options, console), Ok)?;
+        let metrics = perceptual.metrics();
+        let eval =
+            quality::measure_each(&splats, &measured_images, &options, &metrics, &mut |_, _, _| Ok(()), console)?;
         run_dir.write_eval(&eval)?;
         let views = quality::panels(&splats, &measured_images, &options, &eval)?;
         Ok((eval, views))
@@ -319,6 +323,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
                 &format!("PSNR on {} {measured_name} views", eval.views.len()),
             ),
             Figure::new(format!("{:.3}", eval.ssim), "", "SSIM"),
+            Figure::new(format!("{:.3}", eval.more.get("flip").copied().unwrap_or(f64::NAN)), "", "FLIP"),
             Figure::new(grouped(eval.num_gaussians), "", "Gaussians"),
             Figure::new(duration(train_secs), "", "training time"),
         ],
@@ -348,6 +353,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
         grouped(eval.num_gaussians),
         duration(train_secs)
     ));
+    console.note(memory.figures());
     console.note(format_args!("look at `{}`", run_dir.report_path().display()));
     Ok(Trained { run_dir, dataset, cloud, num_steps, eval, report })
 }

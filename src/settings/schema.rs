@@ -84,21 +84,25 @@ fn check<C: DeserializeOwned, T: DeserializeOwned + Default + Serialize>(
 ) -> Result<(), toml::de::Error> {
     match text {
         // By the text, so that the place of what is wrong can be shown.
-        Some(text) if split::<T>(table.clone()).1.is_empty() => toml::from_str::<C>(text).map(drop),
+        Some(text) if split::<T>(table.clone()).0 == *table => toml::from_str::<C>(text).map(drop),
         _ => read::<C, T>(table.clone()).map(drop),
     }
 }
 
-/// What of a table belongs to a library crate, and what to the terms of this program: the tables that `T` has in the
-/// sections of the settings.
+/// What of a table belongs to a library crate, and what to the terms of this program: the keys that `T` has in the sections
+/// of the settings. A section of which nothing is left may be one that only `T` knows.
 fn split<T: Default + Serialize>(mut table: Table) -> (Table, Table) {
-    let known = Table::try_from(T::default()).expect(PLAIN);
+    // JSON has a place for keys without a default.
+    let known = serde_json::to_value(T::default()).expect(PLAIN);
     let mut terms = Table::new();
-    for (section, known) in &known {
-        let (Some(toml::Value::Table(found)), toml::Value::Table(known)) = (table.get_mut(section), known) else {
+    for (section, known) in known.as_object().into_iter().flatten() {
+        let (Some(toml::Value::Table(found)), Some(known)) = (table.get_mut(section), known.as_object()) else {
             continue;
         };
         let own: Table = known.keys().filter_map(|key| found.remove_entry(key)).collect();
+        if found.is_empty() {
+            table.remove(section);
+        }
         if !own.is_empty() {
             terms.insert(section.clone(), own.into());
         }

@@ -187,3 +187,65 @@ fn views_that_would_share_a_file() {
     assert!(said.contains("`a/same.png` and `b/same.png`"), "{said}");
     assert!(!place.path("frames").exists());
 }
+
+/// Replaces parts of the first line of a camera, view or other record of a COLMAP text file that starts with `start`.
+fn edit_record(place: &Place, name: &str, start: &str, edit: impl Fn(&mut Vec<String>)) {
+    let text = place.read(name);
+    let line = text.lines().find(|line| line.starts_with(start)).expect("a record");
+    let mut parts: Vec<String> = line.split(' ').map(str::to_owned).collect();
+    edit(&mut parts);
+    place.write(name, text.replacen(line, &parts.join(" "), 1));
+}
+
+#[test]
+fn camera_with_zero_focal_length() {
+    let place = colmap_only();
+    // CAMERA_ID MODEL WIDTH HEIGHT fx …
+    edit_record(&place, "scene/sparse/0/cameras.txt", "1 PINHOLE", |parts| parts[4] = "0".to_owned());
+    let said = refused(&place);
+    assert!(said.contains("cameras.txt") && said.contains("focal length fx = 0, expected a positive number"), "{said}");
+
+    let place = Place::with_scene();
+    let mut transforms: serde_json::Value = serde_json::from_str(&place.read("scene/transforms.json")).expect("JSON");
+    transforms["fl_x"] = 0.0.into();
+    place.write("scene/transforms.json", transforms.to_string());
+    fs::remove_dir_all(place.path("scene/sparse")).expect("there");
+    let said = refused(&place);
+    assert!(said.contains("transforms.json") && said.contains("focal length"), "{said}");
+}
+
+#[test]
+fn poses_that_are_not_finite() {
+    for (at, value) in [(2, "nan"), (6, "inf")] {
+        let place = colmap_only();
+        // IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME
+        edit_record(&place, "scene/sparse/0/images.txt", "1 ", |parts| parts[at] = value.to_owned());
+        let said = refused(&place);
+        assert!(said.contains("images.txt") && said.contains("finite"), "{said}");
+    }
+    let place = Place::with_scene();
+    fs::remove_dir_all(place.path("scene/sparse")).expect("there");
+    let mut transforms: serde_json::Value = serde_json::from_str(&place.read("scene/transforms.json")).expect("JSON");
+    transforms["frames"][1]["transform_matrix"][0][3] = "here".into();
+    let written = transforms.to_string();
+    for value in ["NaN", "1e999", "null"] {
+        place.write("scene/transforms.json", written.replace("\"here\"", value));
+        let said = refused(&place);
+        assert!(said.contains("transforms.json"), "{value}:\n{said}");
+    }
+}
+
+#[test]
+fn mask_of_another_size() {
+    let place = Place::with_scene();
+    let name = place.list("scene/images").remove(3);
+    fs::create_dir(place.path("scene/masks")).expect("writable");
+    let mask = gazesplat_core::RgbImage8 { width: 48, height: 64, data: vec![255; 48 * 64 * 3] };
+    gazesplat_core::io::save_png(place.path("scene/masks").join(&name), &mask).expect("writable");
+    let said = refused(&place);
+    assert!(said.contains(&format!("masks/{name}")) && said.contains("48 × 64") && said.contains("64 × 48"), "{said}");
+    // A smaller mask of the same shape is one of a scaled copy, and fits.
+    let mask = gazesplat_core::RgbImage8 { width: 32, height: 24, data: vec![255; 32 * 24 * 3] };
+    gazesplat_core::io::save_png(place.path("scene/masks").join(&name), &mask).expect("writable");
+    place.run(&[&["train", "scene", "--out", "out"], SHORT.as_slice()].concat()).done();
+}

@@ -11,6 +11,7 @@ mod eval;
 mod help;
 mod hvsq;
 mod info;
+mod memory;
 mod prune;
 mod render;
 mod resume;

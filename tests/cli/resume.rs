@@ -36,11 +36,13 @@ fn model(place: &Place, dir: &str) -> Vec<u8> {
     std::fs::read(place.path(dir).join("point_cloud.ply")).expect("readable")
 }
 
-/// The lines of the report without their times.
+/// The lines of the report without what differs between two equal runs: times and memory.
 fn metrics(place: &Place, dir: &str) -> Vec<Value> {
     let line = |text: &str| {
         let mut line: Value = serde_json::from_str(text).expect("JSON");
-        line.as_object_mut().expect("an object").remove("step_ms");
+        for of_the_process in ["step_ms", "memory"] {
+            line.as_object_mut().expect("an object").remove(of_the_process).expect("every line has it");
+        }
         line
     };
     place.read(&format!("{dir}/metrics.jsonl")).lines().map(line).collect()
@@ -182,5 +184,74 @@ fn what_cannot_go_on_is_refused_and_stays() {
     assert_eq!((checkpoints(&place, "out"), place.read("out/metrics.jsonl")), (vec![latest, before], report));
     let said = train(&place, &["--out", "out", &format!("--resume={before}")]).done().stderr;
     assert!(said.contains(&format!("resuming `out` at step {before} of 400")), "{said}");
+    assert_same_end(&place, "out", "whole");
+}
+
+/// A run of 400 steps, killed when it has left a checkpoint, and the whole one beside it.
+fn interrupted() -> Place {
+    let place = Place::with_scene();
+    train(&place, &["--out", "whole"]).done();
+    place.kill_when(&args(&["--out", "out"]), || checkpoints(&place, "out").len() == 2);
+    place
+}
+
+#[test]
+fn checkpoint_of_another_version_is_refused_and_stays() {
+    let place = interrupted();
+    let latest = checkpoints(&place, "out")[0];
+    let name = format!("out/checkpoint-{latest}.safetensors");
+    let whole = std::fs::read(place.path(&name)).expect("readable");
+    // The record is a JSON text within the JSON text of the header.
+    let version = format!("\\\"version\\\":\\\"{}", env!("CARGO_PKG_VERSION"));
+    let mut other = version.clone().into_bytes();
+    *other.last_mut().expect("a digit") = b'x';
+    place.edit_bytes(&name, version.as_bytes(), &other);
+    let said = train(&place, &["--out", "out", "--resume"]).refused();
+    assert!(said.contains(&name) && said.contains("it is of version "), "{said}");
+    assert_eq!(checkpoints(&place, "out")[0], latest);
+    place.edit_bytes(&name, b"gazesplat checkpoint 1", b"gazesplat checkpoint 9");
+    let said = train(&place, &["--out", "out", "--resume"]).refused();
+    assert!(said.contains("its format is `gazesplat checkpoint 9`"), "{said}");
+    std::fs::write(place.path(&name), whole).expect("writable");
+    train(&place, &["--out", "out", "--resume"]).done();
+    assert_same_end(&place, "out", "whole");
+}
+
+/// A disk without space, as far as a shell can play one: no file may grow beyond a few blocks of 512 bytes.
+#[cfg(unix)]
+#[test]
+fn disk_that_is_full_costs_no_checkpoint() {
+    let place = interrupted();
+    let file = |step: u32| std::fs::read(place.path(&format!("out/checkpoint-{step}.safetensors"))).expect("readable");
+    let before = checkpoints(&place, "out");
+    let held: Vec<Vec<u8>> = before.iter().map(|&step| file(step)).collect();
+    let model_bytes = model(&place, "whole").len();
+    let report_bytes = place.read("whole/metrics.jsonl").len();
+    // Enough for the report, too little for a checkpoint and for the model.
+    let blocks = (report_bytes / 512 + 4).max(model_bytes / 1024);
+    assert!(
+        512 * blocks < model_bytes && model_bytes < held[0].len(),
+        "{report_bytes} {model_bytes} {}",
+        held[0].len()
+    );
+    let mut script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\"");
+    script.push('\n');
+    let output = std::process::Command::new("sh")
+        .args(["-c", &script])
+        .arg(assert_cmd::cargo::cargo_bin!("gazesplat"))
+        .args(args(&["--out", "out", "--resume"]))
+        .current_dir(place.path("."))
+        .output()
+        .expect("the shell starts");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    assert!(said.contains("warning: no checkpoint of step ") && said.contains("cannot write"), "{said}");
+    assert!(said.contains("error: ") && said.contains("\nhint: ") && !said.contains("panicked"), "{said}");
+    assert_eq!(checkpoints(&place, "out"), before);
+    assert!(before.iter().zip(&held).all(|(&step, bytes)| file(step) == *bytes), "they are as they were");
+    assert!(!place.path("out/point_cloud.ply").exists(), "there is no half of a model");
+    let leftovers: Vec<String> = place.list("out").into_iter().filter(|name| name.ends_with(".part")).collect();
+    assert_eq!(leftovers, Vec::<String>::new());
+    train(&place, &["--out", "out", "--resume"]).done();
     assert_same_end(&place, "out", "whole");
 }

@@ -1,6 +1,6 @@
 //! `lut`, `bench termination`, and the options of `render` and `eval` that go with them.
 
-use crate::support::Place;
+use crate::support::{Place, write_lpips_weights};
 use std::fs;
 
 /// A quick table in `table.json`.
@@ -158,4 +158,24 @@ fn the_study_compares_every_rule() {
     let refused = place.run(&["bench", "termination", "run", "--scene", "scene", "--pixels-per-degree", "0"]).refused();
     assert!(refused.contains("pixels per degree"));
     fs::remove_dir_all(place.path("study")).expect("there");
+}
+
+#[test]
+fn the_study_has_lpips_where_its_weights_are_given() {
+    let place = Place::with_run();
+    write_lpips_weights(&place, "w.safetensors", |_, _| ());
+    let args = ["bench", "termination", "run", "--scene", "scene", "--views", "1", "--repeats", "1", "--out", "study"];
+    let ended = place.run(&[&args[..], &["--lpips-weights", "w.safetensors"]].concat()).done();
+    let rows: serde_json::Value = serde_json::from_str(&ended.stdout).expect("JSON");
+    let lpips: Vec<f64> =
+        rows.as_array().expect("rows").iter().map(|r| r["lpips"].as_f64().expect("a number")).collect();
+    assert!(lpips.iter().all(|v| *v >= 0.0) && lpips.iter().any(|v| *v > 0.0), "{lpips:?}");
+    let csv = place.read("study/termination.csv");
+    assert!(csv.lines().next().is_some_and(|line| line.ends_with(",speed_up,lpips")), "{csv}");
+    let num_columns = |line: &str| line.matches(',').count();
+    assert!(csv.lines().all(|line| num_columns(line) >= num_columns("rule,gamma") + 13), "{csv}");
+    let report: serde_json::Value = serde_json::from_str(&place.read("study/termination.json")).expect("JSON");
+    assert_eq!(report["not_measured"], serde_json::json!([]));
+    let refused = place.run(&[&args[..], &["--lpips-weights", "run/eval.json"]].concat()).refused();
+    assert!(refused.contains("run/eval.json") && refused.contains("no safetensors file"), "{refused}");
 }

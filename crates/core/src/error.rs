@@ -83,7 +83,10 @@ impl Error {
                 ErrorKind::PermissionDenied => Some("check the permissions of the file and of its directory"),
                 ErrorKind::IsADirectory => Some("a file is expected here, this is a directory"),
                 ErrorKind::NotADirectory => Some("a directory is expected here, this is a file"),
-                ErrorKind::StorageFull => Some("free some space and try again"),
+                ErrorKind::StorageFull | ErrorKind::QuotaExceeded => Some("free some space and try again"),
+                ErrorKind::FileTooLarge => Some(
+                    "the disk or a limit of the shell (`ulimit -f`) takes no file of this size: choose another place",
+                ),
                 ErrorKind::ReadOnlyFilesystem => Some("choose a place that can be written"),
                 _ => None,
             },
@@ -106,8 +109,14 @@ mod tests {
 
     #[test]
     fn system_errors_that_a_person_can_mend_have_a_hint() {
-        for kind in [ErrorKind::NotFound, ErrorKind::PermissionDenied, ErrorKind::IsADirectory, ErrorKind::StorageFull]
-        {
+        for kind in [
+            ErrorKind::NotFound,
+            ErrorKind::PermissionDenied,
+            ErrorKind::IsADirectory,
+            ErrorKind::StorageFull,
+            ErrorKind::QuotaExceeded,
+            ErrorKind::FileTooLarge,
+        ] {
             assert!(Error::io("read", "x", kind.into()).hint().is_some(), "{kind:?}");
         }
         assert_eq!(Error::io("read", "x", ErrorKind::Interrupted.into()).hint(), None);

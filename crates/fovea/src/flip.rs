@@ -5,11 +5,14 @@
 //! space (Sec. 4.1.2–4.1.4), and the difference is amplified where edges or points differ (Sec. 4.2). All in `f64`; every
 //! filter is a sum of products of one-dimensional ones, so that images are filtered by rows and columns.
 
+use gazesplat_core::color::from_u8;
 use gazesplat_core::color::lab::lab_from_xyz;
 use gazesplat_core::color::xyz::{linear_from_srgb, white};
 use gazesplat_core::image::ImageF32;
 use gazesplat_render::simd::vectorize;
 use gazesplat_render::{Error, Result};
+use gazesplat_train::losses::LossTarget;
+use gazesplat_train::metrics::{ImageMetric, unmasked};
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use std::f64::consts::PI;
@@ -205,6 +208,46 @@ impl Flip {
         // The white point of `lab` and that of this metric differ in the fifth digit.
         let lab = lab_from_xyz(self.relative_from_linear * linear * white());
         DVec3::new(lab.x, 0.01 * lab.x * lab.y, 0.01 * lab.x * lab.z)
+    }
+}
+
+/// Mean FLIP between an image and its photograph as a metric, over the pixels that the photograph's mask leaves; 0 when all
+/// are masked.
+#[derive(Debug, Clone)]
+pub struct FlipMetric(pub Flip);
+
+impl FlipMetric {
+    /// What is seen of the difference at each pixel, `[H·W]`; 0 where the mask leaves a pixel out.
+    ///
+    /// # Errors
+    /// [`Error::Shape`] if image and photograph differ in size.
+    pub fn map(&self, image: &ImageF32, target: &LossTarget) -> Result<Vec<f64>> {
+        let (width, height) = target.size();
+        let photo = ImageF32 {
+            width: width as u32,
+            height: height as u32,
+            data: target.rgb().iter().map(|v| from_u8(*v)).collect(),
+        };
+        let seen = self.0.appearance(&unmasked(image, target))?;
+        let mut map = self.0.difference(&self.0.appearance(&photo)?, &seen)?;
+        for (value, _) in map.iter_mut().zip(target.mask().unwrap_or_default()).filter(|(_, mask)| **mask == 0) {
+            // Neighbours may be seen here; they are counted where they are.
+            *value = 0.0;
+        }
+        Ok(map)
+    }
+}
+
+impl ImageMetric for FlipMetric {
+    fn name(&self) -> &str {
+        "flip"
+    }
+
+    fn measure(&self, image: &ImageF32, target: &LossTarget) -> gazesplat_train::Result<f64> {
+        let map = self.map(image, target)?;
+        let num = target.mask().map_or(map.len(), |mask| mask.iter().filter(|m| **m != 0).count());
+        // In the order of the pixels, whatever the number of threads.
+        Ok(map.iter().sum::<f64>() / num.max(1) as f64)
     }
 }
 

@@ -3,11 +3,12 @@
 use crate::error::Result;
 use crate::host::read;
 use crate::losses::LossTarget;
-use crate::metrics;
+use crate::metrics::{self, ImageMetric};
 use gazesplat_core::image::ImageF32;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_render::{RenderOptions, Rendered, Splats, render};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// Quality of one view.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -18,6 +19,9 @@ pub struct ViewScore {
     pub psnr: f64,
     /// Mean SSIM.
     pub ssim: f64,
+    /// Further metrics by name, as [`evaluate_with`] was given them.
+    #[serde(flatten)]
+    pub more: BTreeMap<String, f64>,
 }
 
 /// Quality of a model: what `eval.json` holds.
@@ -27,6 +31,9 @@ pub struct EvalReport {
     pub psnr: f64,
     /// Mean of the views' SSIM; 0 without views.
     pub ssim: f64,
+    /// Means of the further metrics by name.
+    #[serde(flatten)]
+    pub more: BTreeMap<String, f64>,
     /// Gaussians of the model.
     pub num_gaussians: usize,
     /// Every view, in the order of the cache.
@@ -44,20 +51,42 @@ pub fn evaluate(
     options: &RenderOptions,
     each: &mut dyn FnMut(&ViewScore, &ImageF32),
 ) -> Result<EvalReport> {
+    evaluate_with(splats, images, options, &[], each)
+}
+
+/// As [`evaluate`], with further `metrics` of every view.
+///
+/// # Errors
+/// As [`evaluate`], and those of the metrics.
+pub fn evaluate_with(
+    splats: &Splats,
+    images: &ImageCache,
+    options: &RenderOptions,
+    metrics: &[&dyn ImageMetric],
+    each: &mut dyn FnMut(&ViewScore, &ImageF32),
+) -> Result<EvalReport> {
     let mut views = Vec::with_capacity(images.len());
     for (index, view) in images.views().iter().enumerate() {
         let target = LossTarget::new(images.get(index)?, options.background);
         let image = rgb(render(splats, &view.camera, options)?)?;
+        let mut more = BTreeMap::new();
+        for metric in metrics {
+            more.insert(metric.name().to_owned(), metric.measure(&image, &target)?);
+        }
         let score = ViewScore {
             name: view.name.clone(),
             psnr: metrics::psnr(&image, &target),
             ssim: metrics::ssim(&image, &target),
+            more,
         };
         each(&score, &image);
         views.push(score);
     }
-    let mean = |value: fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len().max(1) as f64;
-    Ok(EvalReport { psnr: mean(|v| v.psnr), ssim: mean(|v| v.ssim), num_gaussians: splats.len(), views })
+    let mean = |value: &dyn Fn(&ViewScore) -> f64| views.iter().map(value).sum::<f64>() / views.len().max(1) as f64;
+    let names = metrics.iter().map(|metric| metric.name().to_owned());
+    let more = names.map(|name| (name.clone(), mean(&|v| v.more[&name]))).collect();
+    let (psnr, ssim) = (mean(&|v| v.psnr), mean(&|v| v.ssim));
+    Ok(EvalReport { psnr, ssim, more, num_gaussians: splats.len(), views })
 }
 
 /// The expected depth of a frame, `[H, W]` in world units, on the host; `None` unless its options asked for depth.

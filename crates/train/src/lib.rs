@@ -32,7 +32,7 @@ pub mod trainer;
 
 pub use config::Config;
 pub use error::{Error, Result};
-pub use evaluate::{EvalReport, ViewScore, evaluate};
+pub use evaluate::{EvalReport, ViewScore, evaluate, evaluate_with};
 pub use event::{BrokenCounts, DensifyReport, Observer, StageMs, StepReport, TrainEvent};
 pub use run::{Outcome, run, with_threads};
 pub use trainer::Trainer;

@@ -79,7 +79,7 @@ pub struct Trainer {
 }
 
 impl Trainer {
-    /// A trainer at step 0. `images` holds the training views of `dataset`; those of the test views are cached apart.
+    /// A trainer at step 0. `images` holds the training views of `dataset`; those of the test views share its budget.
     ///
     /// # Errors
     /// [`Error::Parameter`] for a setting out of its range, [`Error::NoTrainingViews`].
@@ -132,7 +132,7 @@ impl Trainer {
             state.let_unseen_lag(ShRates { dc, rest });
         }
         let mut trainer = Self {
-            test_images: Arc::new(ImageCache::new(dataset.test.clone(), config.data.cache_bytes)),
+            test_images: Arc::new(images.beside(dataset.test.clone())),
             config: config.clone(),
             images,
             state,

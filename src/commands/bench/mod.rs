@@ -1,6 +1,7 @@
 //! `gazesplat bench`: what a part of the program gains and costs, one file per study.
 
 pub mod ablation;
+pub mod memory;
 pub mod prune_curve;
 pub mod termination;
 
@@ -14,7 +15,8 @@ use clap::{Args, Subcommand};
 Examples:
   gazesplat bench termination model.ply --scene fox --out study
   gazesplat bench prune-curve model.ply --scene fox
-  gazesplat bench ablation runs/fox-1 --scene fox")]
+  gazesplat bench ablation runs/fox-1 --scene fox
+  gazesplat bench memory --steps 300")]
 pub struct BenchArgs {
     /// What to measure
     #[command(subcommand)]
@@ -30,6 +32,8 @@ pub enum Study {
     PruneCurve(prune_curve::CurveArgs),
     /// What scale decay and removal each contribute to a pruning under a guard
     Ablation(ablation::AblationArgs),
+    /// Memory that training on a capture much larger than its image cache takes, against a bound
+    Memory(memory::MemoryArgs),
 }
 
 /// Runs `bench`.
@@ -41,5 +45,6 @@ pub fn command(args: &BenchArgs, console: &Console) -> Result<()> {
         Study::Termination(args) => termination::command(args, console),
         Study::PruneCurve(args) => prune_curve::command(args, console),
         Study::Ablation(args) => ablation::command(args, console),
+        Study::Memory(args) => memory::command(args, console),
     }
 }

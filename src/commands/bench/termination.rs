@@ -11,6 +11,7 @@ mod stops;
 
 use super::super::antialiased::AntialiasedArgs;
 use super::super::device::ComputeDevice;
+use super::super::perceptual::lpips;
 use super::super::termination::{TerminationArgs, constant};
 use super::super::{Model, Split, load_scene, log_machine};
 use crate::cli::{DeviceArgs, SettingsArgs};
@@ -39,7 +40,7 @@ Writes termination.csv, termination.json, error_over_time.svg, flip_over_time.sv
 quality_over_gamma.svg, and of the first view three maps for the strict table at γ = 1, black to pale
 yellow: delta_e.png, the difference from the full image (0 to 1 just-noticeable difference); flip.png,
 what FLIP says of it (0 to 0.1); saved.png, the part of the blends of `fixed 1e-4` that each pixel
-saves (0 to 1). LPIPS is not measured: it needs weights, and this program reads none.")]
+saves (0 to 1). LPIPS is measured where its weights are given.")]
 pub struct StudyArgs {
     /// A model file (PLY, compressed PLY, `.splat`, SPZ), or the directory of a run
     pub model: PathBuf,
@@ -70,6 +71,9 @@ pub struct StudyArgs {
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
+    /// Measure LPIPS to the untruncated image too, with the weights in this safetensors file (README.md says how to make it)
+    #[arg(long, value_name = "FILE")]
+    pub lpips_weights: Option<PathBuf>,
     /// Directory for the results
     #[arg(long, value_name = "DIR", default_value = "bench/termination")]
     pub out: PathBuf,
@@ -109,6 +113,9 @@ pub(super) struct Row {
     pub flip: f64,
     /// FLIP that a thousandth of all pixels exceed.
     pub flip_p999: f64,
+    /// LPIPS to the untruncated image; `None` without weights.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
     /// Pixels that the kernel computed for each pixel of the image, blended or not: see
     /// [`gazesplat_render::RenderStats::num_lane_pixels`].
     pub lane_pixels_per_pixel: f64,
@@ -153,6 +160,7 @@ fn study(args: &StudyArgs, flip: Flip, device: &ComputeDevice, console: &Console
         options: config.render_options(),
         is_gpu: device.is_gpu(),
         flip,
+        lpips: lpips(args.lpips_weights.as_deref(), device)?,
         console,
     };
     let (strict, paper) = (LutSpec::strict().build()?, LutSpec::paper().build()?);
@@ -232,6 +240,7 @@ fn empty_row((rule, gamma, termination): &Rule) -> Row {
         delta_e_above: [0.0; THRESHOLDS.len()],
         flip: 0.0,
         flip_p999: 0.0,
+        lpips: None,
         lane_pixels_per_pixel: 0.0,
         blends_per_pixel: 0.0,
         ms: 0.0,

@@ -3,7 +3,7 @@
 //! Poses are stored world-to-camera with OpenCV axes, which is this project's convention: they are used as they are.
 //! The formats themselves are in [`colmap_bin`] and [`colmap_txt`].
 
-use super::locate::{Photo, ViewBuilder, check_calibration, find_image, find_mask, photo_sizes};
+use super::locate::{Photo, ViewBuilder, check_calibration, find_image, find_mask, mask_dirs, photo_sizes};
 use super::{colmap_bin, colmap_txt};
 use crate::camera::distortion::{LensDistortion, LensModel};
 use crate::dataset::{LoadOptions, Scene, SceneFormat, SparsePoints};
@@ -132,8 +132,9 @@ pub(crate) fn load_scene(
         ));
     }
     let images_dir = find_images_dir(scene, model_dir, options)?;
-    let masks_dir = images_dir.with_file_name("masks");
-    let photos = find_photos(&model, &images_dir, &masks_dir)?;
+    let images_name = images_dir.file_name().unwrap_or_default().to_string_lossy();
+    let masks = mask_dirs(images_dir.parent().unwrap_or(scene), &images_name);
+    let photos = find_photos(&model, &images_dir, &masks)?;
     let sizes = photo_sizes(&photos)?;
     let mut builder = ViewBuilder::new(options.max_side);
     let mut views = Vec::with_capacity(photos.len());
@@ -176,14 +177,14 @@ fn find_images_dir(scene: &Path, model_dir: &Path, options: &LoadOptions) -> Res
     Err(Error::format(scene.join(name), "the directory of the photographs is missing", hint))
 }
 
-fn find_photos(model: &ColmapModel, images_dir: &Path, masks_dir: &Path) -> Result<Vec<Photo>> {
+fn find_photos(model: &ColmapModel, images_dir: &Path, masks: &[PathBuf]) -> Result<Vec<Photo>> {
     let mut photos = Vec::with_capacity(model.images.len());
     let mut missing = Vec::new();
     for image in &model.images {
         let path = images_dir.join(&image.name);
         match find_image(&path) {
             Some(path) => {
-                let mask_path = find_mask(masks_dir, &image.name);
+                let mask_path = find_mask(masks, &image.name);
                 photos.push(Photo { name: image.name.clone(), path, mask_path });
             }
             None => missing.push(path),

@@ -1,6 +1,6 @@
 //! Photographs: decoding, removing lens distortion, fitting to the size of their view.
 
-pub use super::image_cache::ImageCache;
+pub use super::image_cache::{CacheStats, ImageCache};
 use super::jpeg;
 use super::locate::{MAX_SIDE, same_aspect};
 use crate::color::{from_u8, to_u8};

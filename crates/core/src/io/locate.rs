@@ -46,9 +46,20 @@ pub(super) fn find_image(path: &Path) -> Option<PathBuf> {
     })
 }
 
-/// The mask of the photograph `name` in `masks`: `<name>.png` as COLMAP has it, or `<stem>.png`.
-pub(super) fn find_mask(masks: &Path, name: &str) -> Option<PathBuf> {
-    [masks.join(format!("{name}.png")), masks.join(name).with_extension("png")].into_iter().find(|path| path.is_file())
+/// The directories in `base` that may hold the masks of the photographs in the directory `images` of it, best first:
+/// `masks_4` beside `images_4`, whose masks have the size of its photographs, then `masks`.
+pub(super) fn mask_dirs(base: &Path, images: &str) -> Vec<PathBuf> {
+    let scaled = images.strip_prefix("images").filter(|suffix| !suffix.is_empty());
+    scaled.map(|suffix| base.join(format!("masks{suffix}"))).into_iter().chain([base.join("masks")]).collect()
+}
+
+/// The mask of the photograph `name` in the first of `dirs` that has it: `<name>.png` as COLMAP has it, or `<stem>.png`.
+pub(super) fn find_mask(dirs: &[PathBuf], name: &str) -> Option<PathBuf> {
+    let in_dir = |dir: &PathBuf| {
+        let candidates = [dir.join(format!("{name}.png")), dir.join(name).with_extension("png")];
+        candidates.into_iter().find(|path| path.is_file())
+    };
+    dirs.iter().find_map(in_dir)
 }
 
 /// Sizes \[width, height\] of the photographs from their headers, in order.

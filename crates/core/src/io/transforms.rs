@@ -8,15 +8,16 @@
 
 mod calibration;
 mod pose;
+mod split;
 
-use super::locate::{Photo, ViewBuilder, check_calibration, find_image, find_mask, photo_sizes};
+use super::locate::{Photo, ViewBuilder, check_calibration, find_image, find_mask, mask_dirs, photo_sizes};
 use super::ply;
 use crate::dataset::{LoadOptions, Scene, SceneFormat, SparsePoints};
 use crate::error::{Error, Result};
 use crate::view::View;
 use glam::DMat4;
 use serde_json::{Map, Value};
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Component, Path, PathBuf};
 
 /// The training views of the NeRF-synthetic dialect.
@@ -25,7 +26,7 @@ pub(crate) const TRAIN_FILE: &str = "transforms_train.json";
 const TEST_FILE: &str = "transforms_test.json";
 
 /// The scene described by `file`. A `transforms_train.json` brings its own test views if `transforms_test.json` lies
-/// beside it.
+/// beside it; any other file brings its own split if it lists one (`train_filenames` and its kin, see [`split`]).
 ///
 /// # Errors
 /// [`Error::Io`], [`Error::Format`] naming the frame and the key, [`Error::Unsupported`] for camera models that are not
@@ -38,19 +39,24 @@ pub(crate) fn load_scene(file: &Path, options: &LoadOptions) -> Result<Scene> {
     let test = test_file.map(|test| TransformsFile::read(&test, options, &mut warnings)).transpose()?;
     let points = train.points(&mut warnings)?;
     let mut frames = train.frames;
-    let num_train = frames.len();
-    if num_train == 0 {
+    if frames.is_empty() {
         return Err(Error::format(
             file,
             format!("no registered views: none of its {} frames has an image file", train.num_listed),
             "check that `file_path` of the frames is relative to the directory of this file",
         ));
     }
+    let lists = if is_synthetic { None } else { split::Lists::read(file, &train.globals, &train.listed)? };
+    let has_own_split = lists.is_some();
+    let mut num_train = frames.len();
+    if let Some(lists) = lists {
+        (frames, num_train) = lists.divide(file, frames, &mut warnings)?;
+    }
     frames.extend(test.into_iter().flat_map(|test| test.frames));
     strip_common_directory(&mut frames);
     check_unique(file, &frames)?;
     let mut views = make_views(frames, options)?;
-    let own_test = (is_synthetic && views.len() > num_train).then(|| views.split_off(num_train));
+    let own_test = (has_own_split || (is_synthetic && views.len() > num_train)).then(|| views.split_off(num_train));
     let source = if is_synthetic { SceneFormat::NerfSynthetic } else { SceneFormat::Transforms };
     Ok(Scene { views, own_test, points, source, warnings })
 }
@@ -61,11 +67,15 @@ struct TransformsFile {
     globals: Map<String, Value>,
     frames: Vec<Frame>,
     num_listed: usize,
+    /// `file_path` of every frame, with an image or without.
+    listed: HashSet<PathBuf>,
 }
 
 /// A frame whose image exists.
 struct Frame {
     photo: Photo,
+    /// `file_path` as the file has it.
+    listed: PathBuf,
     world_from_camera: DMat4,
     intrinsics: calibration::Intrinsics,
     /// File and frame, for messages.
@@ -85,7 +95,10 @@ impl TransformsFile {
         let Some(Value::Array(listed)) = globals.remove("frames") else {
             return Err(Error::format(path, "the key `frames` is missing or is no array", hint));
         };
-        let mut file = Self { path: path.to_owned(), globals, frames: Vec::new(), num_listed: listed.len() };
+        let paths = listed.iter().filter_map(|frame| frame.get("file_path")?.as_str());
+        let paths = paths.map(|path| relative_image_path(path, None)).collect();
+        let (num_listed, frames) = (listed.len(), Vec::new());
+        let mut file = Self { path: path.to_owned(), globals, frames, num_listed, listed: paths };
         let mut missing = Vec::new();
         for (index, frame) in listed.iter().enumerate() {
             match file.frame(index, frame, options, warnings)? {
@@ -132,7 +145,8 @@ impl TransformsFile {
         let name = view_name(&relative, &found);
         let mask_path = self.mask(keys, &relative, &name, warnings);
         let photo = Photo { name, path: found, mask_path };
-        Ok(Ok(Frame { photo, world_from_camera, intrinsics, origin: (self.path.clone(), context) }))
+        let listed = relative_image_path(listed_path, None);
+        Ok(Ok(Frame { photo, listed, world_from_camera, intrinsics, origin: (self.path.clone(), context) }))
     }
 
     /// The mask a frame names, else the one in `masks` beside the images.
@@ -143,14 +157,18 @@ impl TransformsFile {
         name: &str,
         warnings: &mut Vec<String>,
     ) -> Option<PathBuf> {
+        let images = relative.components().next().unwrap_or(Component::CurDir).as_os_str().to_string_lossy();
+        let masks = mask_dirs(self.directory(), &images);
         if let Some(mask) = keys.get("mask_path").and_then(Value::as_str) {
-            let path = self.directory().join(mask.replace('\\', "/"));
-            if path.is_file() {
-                return Some(path);
+            let listed = relative_image_path(mask, None);
+            // As with the images: the scaled directory instead of the one that is named.
+            let scaled = masks[0].join(listed.components().skip(1).collect::<PathBuf>());
+            let path = self.directory().join(&listed);
+            if let Some(found) = [scaled, path.clone()].into_iter().find(|path| path.is_file()) {
+                return Some(found);
             }
             warnings.push(format!("the mask `{}` of `{name}` is missing, the image is used without", path.display()));
         }
-        let masks = self.directory().join("masks");
         let in_images = relative.components().skip(1).collect::<PathBuf>().to_string_lossy().replace('\\', "/");
         [in_images.as_str(), name].into_iter().filter(|name| !name.is_empty()).find_map(|name| find_mask(&masks, name))
     }

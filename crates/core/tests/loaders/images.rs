@@ -171,6 +171,42 @@ fn cache_keeps_its_budget_and_drops_the_least_recently_used() {
 }
 
 #[test]
+fn caches_beside_each_other_share_one_budget() {
+    let scene = Scene::new();
+    let cache = cache(&scene, 3, 700);
+    let other = cache.beside((0..2).map(|i| view(scene.write_image(&format!("b{i}.png"), [10, 10]), 10, 10)).collect());
+    cache.get(0).unwrap();
+    cache.get(1).unwrap();
+    let held = other.get(0).unwrap();
+    // 0 of the first one had to go.
+    assert_eq!((cache.num_bytes(), other.num_bytes()), (300, 300));
+    assert!(Arc::ptr_eq(&held, &other.get(0).unwrap()));
+    let stats = cache.stats();
+    assert_eq!(stats, other.stats());
+    assert_eq!((stats.byte_budget, stats.num_bytes, stats.peak_bytes), (700, 600, 600));
+    assert_eq!((stats.num_hits, stats.num_misses), (1, 3));
+    // Full: nothing more is decoded ahead, and nothing that is held goes.
+    assert_eq!((cache.preload(|_, _| ()).unwrap(), cache.stats().num_misses), (1, 3));
+    drop(other);
+    assert_eq!(cache.stats().num_bytes, 300, "what it held is free again");
+    assert_eq!((cache.preload(|_, _| ()).unwrap(), cache.num_bytes()), (2, 600));
+}
+
+#[test]
+fn alpha_and_masks_count() {
+    let scene = Scene::new();
+    let path = save(&scene, "a.png", RgbaImage::from_pixel(10, 10, Rgba([1, 2, 3, 9])), ImageFormat::Png);
+    let mask = save(&scene, "m.png", GrayImage::from_fn(10, 10, |x, _| Luma([x as u8])), ImageFormat::Png);
+    let masked = View { mask_path: Some(mask), ..view(path, 10, 10) };
+    let cache = ImageCache::new(vec![masked.clone()], 500);
+    cache.get(0).unwrap();
+    assert_eq!((cache.num_bytes(), cache.stats().peak_bytes), (500, 500));
+    let small = ImageCache::new(vec![masked], 499);
+    small.get(0).unwrap();
+    assert_eq!(small.num_bytes(), 0);
+}
+
+#[test]
 fn images_larger_than_the_budget_are_served_but_not_kept() {
     let scene = Scene::new();
     let cache = cache(&scene, 2, 299);

@@ -238,3 +238,74 @@ fn names_with_blanks_and_of_any_language_are_found() {
     let found: Vec<String> = data.all_views().iter().map(|view| view.name.clone()).collect();
     assert_eq!(found, ["zwei Wörter.png", "☃ (копия).png", "東京/写真 1.png"]);
 }
+
+fn names(views: &[gazesplat_core::View]) -> Vec<&str> {
+    views.iter().map(|view| view.name.as_str()).collect()
+}
+
+#[test]
+fn split_lists_of_nerfstudio_are_followed() {
+    let frames: Vec<Value> =
+        ["a", "b", "c", "d", "e"].iter().map(|name| frame(&format!("images/{name}.png"), 0.0)).collect();
+    let split = |lists: Value| {
+        let mut content = json!({"fl_x": 15.0, "frames": frames});
+        content.as_object_mut().unwrap().extend(lists.as_object().unwrap().clone());
+        load(&scene(&content))
+    };
+    let data = split(json!({
+        "train_filenames": ["images/d.png", "./images/a.png"], "test_filenames": ["images/c.png"],
+        "val_filenames": ["images/b.png"],
+    }))
+    .unwrap();
+    assert_eq!((names(&data.train), names(&data.test)), (vec!["a.png", "d.png"], vec!["c.png"]));
+    assert!(data.warnings[0].contains("2 of 5 frames are neither training nor test views"), "{:?}", data.warnings);
+    // Validation views judge where there are no test views, and train nowhere.
+    let data = split(json!({"val_filenames": ["images/b.png"]})).unwrap();
+    assert_eq!((names(&data.train), names(&data.test)), (vec!["a.png", "c.png", "d.png", "e.png"], vec!["b.png"]));
+    let data = split(json!({"test_filenames": ["images/b.png"], "val_filenames": ["images/c.png"]})).unwrap();
+    assert_eq!((names(&data.train), names(&data.test)), (vec!["a.png", "d.png", "e.png"], vec!["b.png"]));
+    // Without one of them every view may train: the rule by number is not asked.
+    let all: Vec<String> = ["a", "b", "c", "d", "e"].iter().map(|name| format!("images/{name}.png")).collect();
+    let data = split(json!({ "train_filenames": all })).unwrap();
+    assert_eq!((data.train.len(), data.test.len()), (5, 0));
+
+    for (lists, words) in [
+        (
+            json!({"train_filenames": ["images/x.png"]}),
+            "`train_filenames`: no frame has the `file_path` `images/x.png`",
+        ),
+        (json!({"val_filenames": "images/a.png"}), "`val_filenames`: found no array"),
+        (json!({"test_filenames": [3]}), "`test_filenames`: found 3, expected a file name"),
+        (json!({"train_filenames": []}), "leaves no frame with an image file to train on"),
+        (
+            json!({"train_filenames": ["images/a.png"], "val_filenames": ["images/a.png"]}),
+            "`images/a.png` is in `train_filenames` and in `val_filenames`",
+        ),
+    ] {
+        assert_says(&split(lists).unwrap_err(), "transforms.json", &[words]);
+    }
+}
+
+#[test]
+fn scaled_images_take_their_scaled_masks_first() {
+    let mut named = frame("images/a.png", 0.0);
+    named["mask_path"] = json!("masks/special.png");
+    let content = json!({"fl_x": 15.0, "w": 20, "h": 10, "frames": [named, frame("images/b.png", 1.0)]});
+    let scene = scene(&content);
+    for name in ["a", "b"] {
+        scene.write_image(&format!("images_2/{name}.png"), [10, 5]);
+    }
+    for name in ["masks/special.png", "masks/b.png", "masks_2/b.png"] {
+        scene.write(name, "");
+    }
+    let masks = |images: Option<&str>| -> Vec<String> {
+        let options = LoadOptions { images: images.map(str::to_owned), ..LoadOptions::default() };
+        let data = Dataset::load(scene.path(), &options).unwrap();
+        let name = |path: &std::path::Path| path.strip_prefix(scene.path()).unwrap().to_string_lossy().into_owned();
+        data.all_views().iter().map(|view| name(view.mask_path.as_deref().unwrap())).collect()
+    };
+    assert_eq!(masks(None), ["masks/special.png", "masks/b.png"]);
+    assert_eq!(masks(Some("images_2")), ["masks/special.png", "masks_2/b.png"]);
+    scene.write("masks_2/special.png", "");
+    assert_eq!(masks(Some("images_2")), ["masks_2/special.png", "masks_2/b.png"]);
+}

@@ -6,8 +6,10 @@ pub use guard::{Bound, Guard};
 
 use crate::kernels::cpu::l1_ssim::{Comparison, similarity};
 use crate::losses::LossTarget;
+use gazesplat_core::color::from_u8;
 use gazesplat_core::image::ImageF32;
 use rayon::prelude::*;
+use std::borrow::Cow;
 
 /// A measure of how close an image comes to its photograph.
 pub trait ImageMetric: Send + Sync {
@@ -57,6 +59,22 @@ fn check_size(image: &ImageF32, target: &LossTarget) -> crate::Result<()> {
     }
     let text = format!("found {} x {}, expected {} x {}", found.0, found.1, target.size().0, target.size().1);
     Err(crate::Error::parameter("size of the image", text))
+}
+
+/// `image` with the photograph's colours where its mask leaves pixels out: for metrics of neighbourhoods, to which a pixel
+/// that must not count is best one that does not differ.
+pub fn unmasked<'a>(image: &'a ImageF32, target: &LossTarget) -> Cow<'a, ImageF32> {
+    let Some(mask) = target.mask().filter(|mask| 3 * mask.len() == image.data.len()) else {
+        return Cow::Borrowed(image);
+    };
+    let mut image = image.clone();
+    let pixels = image.data.chunks_exact_mut(3).zip(target.rgb().chunks_exact(3)).zip(mask);
+    for ((pixel, color), _) in pixels.filter(|(_, m)| **m == 0) {
+        for (v, c) in pixel.iter_mut().zip(color) {
+            *v = from_u8(*c);
+        }
+    }
+    Cow::Owned(image)
 }
 
 /// Value reported for identical images, and the largest one: a mean over views has to stay finite.

@@ -10,6 +10,7 @@ use gazesplat_core::image::ImageF32;
 use gazesplat_core::io::images::ImageCache;
 use gazesplat_core::rng::Rng;
 use gazesplat_fovea::flip::Flip;
+use gazesplat_fovea::lpips::Lpips;
 use gazesplat_render::{RenderOptions, RenderStats, Splats, StatsMode, Termination, TerminationLut, render};
 use gazesplat_train::evaluate::rgb;
 use gazesplat_train::losses::LossTarget;
@@ -27,6 +28,7 @@ pub(super) struct Bench<'a> {
     pub options: RenderOptions,
     pub is_gpu: bool,
     pub flip: Flip,
+    pub lpips: Option<Lpips>,
     pub console: &'a Console,
 }
 
@@ -100,6 +102,9 @@ impl Bench<'_> {
                 row.psnr_to_full += share * psnr_between(&image, &full);
                 row.blends_per_pixel += stats.num_blended as f64 / self.num_pixels();
                 row.lane_pixels_per_pixel += stats.num_lane_pixels as f64 / self.num_pixels();
+                if let Some(lpips) = &self.lpips {
+                    *row.lpips.get_or_insert(0.0) += share * lpips.distance(&image, &full)?;
+                }
                 delta_e.add(&differences(&image, &full));
                 flip.add(&self.flip.difference(&seen, &self.flip.appearance(&image)?)?);
                 bar.inc(1);

@@ -41,6 +41,11 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
     create_all(dir)?;
     write_text(&dir.join("termination.csv"), &csv(results.rows))?;
     let views: Vec<&str> = results.views.iter().map(|v| v.name.as_str()).collect();
+    // Every row has LPIPS, or none.
+    let not_measured: &[&str] = match results.rows.iter().all(|row| row.lpips.is_some()) {
+        true => &[],
+        false => &["LPIPS: its weights are given with `--lpips-weights`"],
+    };
     let report = json!({
         "model": results.model.display().to_string(),
         "device": results.device.describe(),
@@ -50,7 +55,7 @@ pub(super) fn write(dir: &Path, results: &Results<'_>) -> Result<()> {
         "pixels_per_degree": results.pixels_per_degree,
         "delta_e_thresholds": THRESHOLDS,
         "stops_of_strict": results.stops,
-        "not_measured": ["LPIPS: it needs weights, and this program reads none"],
+        "not_measured": not_measured,
         "rows": results.rows,
     });
     write_text(&dir.join("termination.json"), &format!("{}\n", to_json(&report)))?;
@@ -121,11 +126,14 @@ fn csv(rows: &[Row]) -> String {
         ("ms", |r| r.ms),
         ("speed_up", |r| r.speed_up),
     ];
-    let mut text = format!("rule,gamma,{}\n", columns.map(|c| c.0).join(","));
+    let has_lpips = rows.iter().any(|row| row.lpips.is_some());
+    let lpips_name = if has_lpips { ",lpips" } else { "" };
+    let mut text = format!("rule,gamma,{}{lpips_name}\n", columns.map(|c| c.0).join(","));
     for r in rows {
         let gamma = r.gamma.map_or_else(String::new, |g| g.to_string());
         let values = columns.map(|(_, value)| value(r).to_string()).join(",");
-        text.push_str(&format!("\"{}\",{gamma},{values}\n", r.rule));
+        let lpips = r.lpips.map_or_else(String::new, |value| format!(",{value}"));
+        text.push_str(&format!("\"{}\",{gamma},{values}{lpips}\n", r.rule));
     }
     text
 }
@@ -137,6 +145,9 @@ pub(super) fn table(rows: &[Row]) -> String {
         "{:width$}  {:>6}  {:>6}  {:>6}  {:>7}  {:>7}  {:>7}  {:>7}  {:>7}  {:>7}  {:>8}  {:>8}",
         "rule", "γ", "PSNR", "SSIM", "to full", "ΔE max", "ΔE 99.9", "FLIP", "blends", "lanes", "ms", "speed-up"
     )];
+    if rows.iter().any(|row| row.lpips.is_some()) {
+        lines[0].push_str("    LPIPS");
+    }
     for r in rows {
         let gamma = r.gamma.map_or_else(String::new, |g| format!("{g:.3}"));
         lines.push(format!(
@@ -153,6 +164,9 @@ pub(super) fn table(rows: &[Row]) -> String {
             r.ms,
             r.speed_up
         ));
+        if let (Some(line), Some(lpips)) = (lines.last_mut(), r.lpips) {
+            line.push_str(&format!("  {lpips:>7.5}"));
+        }
     }
     lines.join("\n")
 }

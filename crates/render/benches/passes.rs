@@ -9,6 +9,7 @@ use gazesplat_core::synthetic::{bench_camera, bench_cloud};
 use gazesplat_core::{Camera, GaussianCloud};
 use gazesplat_render::TerminationLut;
 use gazesplat_render::kernels::cpu::bin::{BinExtras, TileGrid, TileLists, bin};
+use gazesplat_render::kernels::cpu::pose_bwd::pose_bwd;
 use gazesplat_render::kernels::cpu::project::{GaussianSlices, ProjectedSplats, ViewSpec, project};
 use gazesplat_render::kernels::cpu::project_bwd::project_bwd;
 use gazesplat_render::kernels::cpu::rasterize::{RasterOptions, rasterize};
@@ -92,6 +93,10 @@ fn passes(c: &mut Criterion) {
         });
         group.bench_function("project_bwd", |b| {
             b.iter(|| project_bwd(black_box(&g), &spec, &splats, &lists, &pairs, false));
+        });
+        let v = project_bwd(&g, &spec, &splats, &lists, &pairs, false);
+        group.bench_function("pose_bwd", |b| {
+            b.iter(|| pose_bwd(black_box(&g), &spec, &splats.global_from_compact, &v));
         });
         group.finish();
     }

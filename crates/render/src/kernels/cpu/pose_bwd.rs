@@ -13,6 +13,7 @@ use crate::math::pose::{TwistGradient, torque, twist_vjp};
 use crate::math::quat::Quat;
 use crate::math::sh;
 use crate::math::vec::Vec3;
+use crate::simd::vectorize;
 use rayon::prelude::*;
 
 /// Gradient of the pose as a twist from the left, (ω, v): per radian and per world unit, in camera axes. `v` are the
@@ -22,10 +23,15 @@ pub fn pose_bwd(g: &GaussianSlices<'_>, view: &ViewSpec, visible: &[u32], v: &Pa
         .par_chunks(CLUSTER)
         .map(|chunk| {
             let mut sum = [0.0; 6];
-            for &id in chunk {
-                let TwistGradient { omega, v } = row_gradient(g, view, id as usize, v);
-                add_finite(&mut sum, [omega.x, omega.y, omega.z, v.x, v.y, v.z]);
-            }
+            vectorize(
+                #[inline(always)]
+                || {
+                    for &id in chunk {
+                        let TwistGradient { omega, v } = row_gradient(g, view, id as usize, v);
+                        add_finite(&mut sum, [omega.x, omega.y, omega.z, v.x, v.y, v.z]);
+                    }
+                },
+            );
             sum
         })
         .collect();
@@ -39,6 +45,7 @@ pub fn pose_bwd(g: &GaussianSlices<'_>, view: &ViewSpec, visible: &[u32], v: &Pa
 }
 
 /// Adds a part, unless a value of it is not finite.
+#[inline(always)]
 fn add_finite(sum: &mut [f64; 6], part: [f32; 6]) {
     if part.iter().all(|v| v.is_finite()) {
         for (s, v) in sum.iter_mut().zip(part) {
@@ -48,6 +55,7 @@ fn add_finite(sum: &mut [f64; 6], part: [f32; 6]) {
 }
 
 /// The part of Gaussian `i`.
+#[inline(always)]
 fn row_gradient(g: &GaussianSlices<'_>, view: &ViewSpec, i: usize, v: &ParameterGradients) -> TwistGradient {
     let mean = g.mean(i);
     let in_camera = to_camera(view.params, mean);

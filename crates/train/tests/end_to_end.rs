@@ -1,4 +1,6 @@
 //! Whole training runs on a small procedural scene: quality, reproducibility, failure.
+//!
+//! The file is long because every strategy runs on the same scene with the same helpers.
 
 #![expect(clippy::unwrap_used, reason = "a helper of a test may panic like the test")]
 

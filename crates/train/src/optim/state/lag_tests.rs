@@ -290,7 +290,8 @@ fn a_loss_that_is_no_number_changes_nothing_of_what_lags() {
 
 #[test]
 fn every_operation_on_rows_finds_them_up_to_date() {
-    let operations: [(&str, fn(&mut ModelState)); 5] = [
+    type Operation = fn(&mut ModelState);
+    let operations: [(&str, Operation); 5] = [
         ("sort", |state| state.sort_spatially([0.0; 3], 4.0).expect("it fits")),
         ("select", |state| state.select_rows((0..N as u32).rev().filter(|i| i % 5 > 0).collect()).expect("it fits")),
         ("widen", |state| state.widen_sh(9).expect("it fits")),

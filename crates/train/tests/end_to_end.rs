@@ -92,7 +92,7 @@ impl Observer for Log {
             TrainEvent::Evaluated { report, .. } => self.psnr = Some(report.psnr),
             TrainEvent::Densified { .. } => self.num_densified += 1,
             TrainEvent::Finished { .. } => self.finished = true,
-            TrainEvent::Started { .. } | TrainEvent::LoadingImages { .. } => {}
+            TrainEvent::Started { .. } | TrainEvent::LoadingImages { .. } | TrainEvent::Resolution { .. } => {}
         }
         Ok(())
     }

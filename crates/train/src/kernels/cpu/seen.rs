@@ -30,6 +30,15 @@ pub struct Missing<'a> {
     pub lanes: &'a [f32],
 }
 
+/// An update of rows that may have missed some before it.
+#[derive(Debug, Clone)]
+struct Update<'a> {
+    missing: &'a Missing<'a>,
+    /// Learning rate of each value of a row with the bias correction of the first moment.
+    rates: &'a [f32],
+    step: &'a Step,
+}
+
 impl Missing<'_> {
     /// Updates that the moments of a row with this word have missed.
     fn of_moments(&self, word: u32) -> u32 {
@@ -122,13 +131,14 @@ pub fn update_seen(rows: &mut Rows, grads: &[f32], last: &mut [u32], missing: &M
     let (params, first, second) = (&mut rows.params.data[sh], &mut rows.first.data[sh], &mut rows.second.data[sh]);
     assert!(params.len() == last.len() * rates.len() && grads.len() == params.len());
     let chunk = CHUNK * rates.len();
+    let update = Update { missing, rates: &rates, step };
     params
         .par_chunks_mut(chunk)
         .zip(grads.par_chunks(chunk))
         .zip(first.par_chunks_mut(chunk))
         .zip(second.par_chunks_mut(chunk))
         .zip(last.par_chunks_mut(CHUNK))
-        .for_each(|((((p, g), m), v), words)| update_chunk(p, g, m, v, words, missing, &rates, step));
+        .for_each(|((((p, g), m), v), words)| update_chunk(p, g, m, v, words, &update));
 }
 
 dispatch_simd! {
@@ -177,10 +187,9 @@ fn decay_kernel<const FMA: bool>(first: &mut [f32], second: &mut [f32], words: &
 }
 
 dispatch_simd! {
-    fn update_chunk(params: &mut [f32], grads: &[f32], first: &mut [f32], second: &mut [f32], words: &mut [u32], missing: &Missing<'_>, rates: &[f32], step: &Step) = update_kernel;
+    fn update_chunk(params: &mut [f32], grads: &[f32], first: &mut [f32], second: &mut [f32], words: &mut [u32], update: &Update<'_>) = update_kernel;
 }
 
-#[expect(clippy::too_many_arguments, reason = "the tensors of Adam, what rows missed, and the constants of the update")]
 #[inline(always)]
 fn update_kernel<const FMA: bool>(
     params: &mut [f32],
@@ -188,10 +197,9 @@ fn update_kernel<const FMA: bool>(
     first: &mut [f32],
     second: &mut [f32],
     words: &mut [u32],
-    missing: &Missing<'_>,
-    rates: &[f32],
-    step: &Step,
+    update: &Update<'_>,
 ) {
+    let &Update { missing, rates, step } = update;
     let width = rates.len();
     let rows = params
         .chunks_exact_mut(width)

@@ -293,7 +293,8 @@ const BOUNDS: Bounds = Bounds { center: [0.0; 3], max_log_scale: 5.0, max_distan
 
 #[test]
 fn every_operation_on_rows_finds_them_up_to_date() {
-    let operations: [(&str, fn(&mut ModelState)); 7] = [
+    type Operation = fn(&mut ModelState);
+    let operations: [(&str, Operation); 7] = [
         ("sort", |state| state.sort_spatially([0.0; 3], 4.0).expect("it fits")),
         ("select", |state| state.select_rows((0..N as u32).rev().filter(|i| i % 5 > 0).collect()).expect("it fits")),
         ("widen", |state| state.widen_sh(9).expect("it fits")),

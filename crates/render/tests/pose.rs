@@ -6,7 +6,7 @@ use gazesplat_core::camera::se3;
 use gazesplat_render::{MeansProbe, Pass, PoseProbe, Probes, RenderOptions, Splats, render_with};
 use gazesplat_testkit::finite_diff::{central, central_f32};
 use gazesplat_testkit::{Rng, Tolerance, assert_close, reference};
-use glam::{DMat4, DVec3, DVec4, Mat3, Vec3};
+use glam::{DMat4, DVec3, Mat3, Vec3};
 
 use crate::common::scenes::{Draw, empty_cloud, logit, push, random, scene, upstream};
 use crate::common::{Scene, device, host, interleaved, with_gpu};
@@ -28,7 +28,7 @@ fn reference_pose_gradient(scene: &Scene, weights: &[f32], step: f64) -> Vec<f64
     let pose = DMat4::from_cols_array_2d(&camera.camera_from_world).transpose();
     let mut loss = |twist: &[f64]| {
         let moved = se3::exp(std::array::from_fn(|k| twist[k])) * pose;
-        let rows = std::array::from_fn(|row| DVec4::from(moved.row(row)).to_array());
+        let rows = std::array::from_fn(|row| moved.row(row).to_array());
         let frame = reference::render(&gaussians, &reference::Camera { camera_from_world: rows, ..camera }, &options);
         interleaved(&frame, scene.channels()).iter().zip(weights).map(|(v, &w)| v * f64::from(w)).sum()
     };
@@ -263,7 +263,14 @@ fn sum_over_many_splats_is_off_by_the_depth_of_a_tree() {
     println!("off by {:.1e} of the magnitudes, bound {:.1e}", d.max_abs / magnitude, bound / magnitude);
 }
 
-/// The tolerance is that of the parameters' gradients (`gpu_equals_cpu`), of the magnitudes that are summed: how far they
+/// A scene, its gradient on the CPU, and the magnitudes it is a sum of.
+type Case = (Scene, Vec<f32>, [f64; 2]);
+
+thread_local! {
+    static CPU: std::cell::RefCell<Vec<Case>> = const { std::cell::RefCell::new(Vec::new()) };
+}
+
+/// The tolerance is a tenth of that of the parameters' gradients (`gpu_equals_cpu`), of the magnitudes that are summed: how far they
 /// cancel is no fault of either.
 #[test]
 fn pose_gradients_of_the_gpu_are_those_of_the_cpu() {
@@ -274,7 +281,6 @@ fn pose_gradients_of_the_gpu_are_those_of_the_cpu() {
         })
         .collect();
     let run = |scene: &Scene| scene.frame_and_gradients(&sturdy_upstream(7, scene)).1;
-    thread_local!(static CPU: std::cell::RefCell<Vec<(Scene, Vec<f32>, [f64; 2])>> = const { std::cell::RefCell::new(Vec::new()) });
     CPU.set(
         scenes
             .into_iter()

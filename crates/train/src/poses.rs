@@ -143,8 +143,8 @@ impl PoseRefiner {
             let share: f64 =
                 self.poses.iter().zip(mode).map(|(pose, m)| dot(&scaled(&pose.twist, self.extent), m)).sum();
             for (pose, m) in self.poses.iter_mut().zip(mode) {
-                for k in 0..6 {
-                    pose.twist[k] -= share * m[k] * if k < 3 { 1.0 } else { self.extent };
+                for (k, (twist, m)) in pose.twist.iter_mut().zip(m).enumerate() {
+                    *twist -= share * m * if k < 3 { 1.0 } else { self.extent };
                 }
             }
         }

@@ -34,7 +34,7 @@ pub fn times(m: Mat3, a: Vec3) -> Vec3 {
     Vec3 { x: dot(m.row0, a), y: dot(m.row1, a), z: dot(m.row2, a) }
 }
 
-/// Gradient of a turn of the rotation `q` by exp([θ]×) from the left, in world axes: of θ at 0, for the gradient `v` of the
+/// Gradient of a turn of the rotation `q` by the angle vector θ from the left, in world axes: of θ at 0, for the gradient `v` of the
 /// raw quaternion. The turned one is (1, θ/2) ⊗ q to first order, of whatever length.
 #[cfg_attr(feature = "gpu", cube)]
 #[inline(always)]

@@ -119,9 +119,9 @@ fn oracle(tensors: &[Tensor], a: &ImageF32, b: &ImageF32) -> f64 {
             for x in 0..width {
                 let length = |p: &Planes| p.iter().map(|plane| plane[y][x].powi(2)).sum::<f64>().sqrt() + 1e-10;
                 let (first, second) = (length(&planes[0]), length(&planes[1]));
-                for c in 0..lin.values.len() {
+                for (c, weight) in lin.values.iter().enumerate() {
                     let d = planes[0][c][y][x] / first - planes[1][c][y][x] / second;
-                    sum += f64::from(lin.values[c]) * d * d;
+                    sum += f64::from(*weight) * d * d;
                 }
             }
         }

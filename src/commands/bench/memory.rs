@@ -235,7 +235,7 @@ fn train(dir: &Path, args: &MemoryArgs, console: &Console) -> Result<Figures> {
         image_bytes_peak: memory("image_bytes_peak")?,
         image_hits: memory("image_hits")?,
         image_misses: memory("image_misses")?,
-        steps: args.steps,
+        steps: last["step"].as_u64().and_then(|step| u32::try_from(step).ok()).unwrap_or(0),
         num_gaussians: cloud.len(),
         parameter_bytes,
         peak_resident_bytes: peak,

@@ -290,9 +290,7 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
 
     let started = Instant::now();
     let measured_images = match &refined {
-        Some(refined) if measured == Measured::Training => {
-            Arc::new(measured_images.beside(refined.views.clone()))
-        }
+        Some(refined) if measured == Measured::Training => Arc::new(measured_images.beside(refined.views.clone())),
         _ => measured_images,
     };
     let options = config.render_options();

@@ -1,4 +1,6 @@
 //! A model in training: parameters and moments as tensors on one device, and how many updates they have seen.
+//!
+//! The file is long because every change of a model is one method here, of a few lines each.
 
 use super::{AdamSettings, Columns, LearningRates, Regularizers, ShRates};
 use crate::backend::{

@@ -377,8 +377,7 @@ fn list_pairs(
         if comptime!(wants_maximum) {
             let at = pair_splats[record as usize] as usize * lane::COUNT + lane::RED;
             let largest = f32::max(f32::max(lanes[at], lanes[at + 1]), lanes[at + 2]);
-            // The bits of positive floats order like the floats. Most splats stay below 1, which counts anyway.
-            // A pair without a tile, behind the last, has no maximum.
+            // The bits of positive floats order like the floats. Pairs behind the last tile have no maximum.
             if largest > 1.0_f32 && tile < num_tiles {
                 color_max[tile as usize].fetch_max(u32::reinterpret(largest));
             }

@@ -1,5 +1,5 @@
 //! The loop against its specification, on the CPU and, where there is one, on a GPU: a scripted guard, roll-backs,
-//! interruption.
+//! interruption. The file is long because all of it goes through one small scene and its helpers.
 
 use super::config::{PruneSection, ReferenceSection};
 use super::phase::Phase;

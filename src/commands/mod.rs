@@ -131,6 +131,10 @@ impl Model {
         for note in &report.notes {
             console.warn(format_args!("`{}`: {note}", file.display()));
         }
+        if let Some(poses) = run.as_ref().map(RunDir::poses_path).filter(|poses| poses.is_file()) {
+            let poses = poses.display();
+            console.note(format_args!("camera poses were refined: `--set data.poses={poses}` sees the scene by them"));
+        }
         if report.num_dropped_non_finite > 0 {
             console.warn(format_args!(
                 "`{}`: left out {} of {} Gaussians with values that are not finite",

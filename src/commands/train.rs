@@ -145,6 +145,18 @@ pub fn train(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result
     with_threads(job.config.train.threads, || train_here(job, stop, console))?
 }
 
+/// Refuses to remove, with a run that is replaced, the poses that the new one is to see by.
+fn check_poses_stay(config: &Config, out: &Path, overwrite: bool) -> Result<()> {
+    let Some(poses) = config.data.poses.as_ref().filter(|_| overwrite) else { return Ok(()) };
+    match (Path::new(poses).canonicalize(), out.canonicalize()) {
+        (Ok(poses), Ok(out)) if poses.starts_with(&out) => {
+            Err(Failure::new(format!("`--overwrite` would remove `{}`, which `data.poses` names", poses.display()))
+                .hint("choose another directory with `--out`, or copy the file elsewhere first"))
+        }
+        _ => Ok(()),
+    }
+}
+
 fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Result<Trained> {
     let config = &job.config;
     log_machine();
@@ -173,7 +185,10 @@ fn train_here(job: &TrainJob<'_>, stop: &AtomicBool, console: &Console) -> Resul
     let perceptual = Perceptual::new(job.terms.eval.lpips_weights.as_deref(), job.device)?;
     let run_dir = match job.out {
         Some(out) if job.resume.is_some() => RunDir::open_interrupted(out)?,
-        Some(out) => RunDir::create(out, job.overwrite)?,
+        Some(out) => {
+            check_poses_stay(config, out, job.overwrite)?;
+            RunDir::create(out, job.overwrite)?
+        }
         None => RunDir::create_numbered(&scene_name(job.scene))?,
     };
 

@@ -31,7 +31,8 @@ fn refined_poses_are_kept_and_a_scene_can_be_seen_by_them() {
         let ended = place.run(&[&["eval", "run", "--scene", "scene"], more].concat()).done();
         (serde_json::from_str::<Value>(&ended.stdout).expect("JSON"), ended.stderr)
     };
-    let (plain, _) = eval(&[]);
+    let (plain, said) = eval(&[]);
+    assert!(said.contains("`--set data.poses=run/poses.json` sees the scene by them"), "{said}");
     let (with, said) = eval(&["--set", "data.poses=run/poses.json"]);
     assert!(said.contains("7 of 9 camera poses are those of `run/poses.json`"), "{said}");
     assert_eq!(plain["psnr"], with["psnr"]);
@@ -39,6 +40,10 @@ fn refined_poses_are_kept_and_a_scene_can_be_seen_by_them() {
     assert_ne!(training(&[]), training(&["--set", "data.poses=run/poses.json"]));
     // A run begins there, too, and says of no file what is wrong with it.
     train(&place, &["--out", "again", "--set", "data.poses=run/poses.json"]).done();
+    // What a run sees by is not removed with the run it replaces.
+    let before = place.read("run/poses.json");
+    let said = train(&place, &["--out", "run", "--overwrite", "--set", "data.poses=run/poses.json"]).refused();
+    assert!(said.contains("`--overwrite` would remove") && place.read("run/poses.json") == before, "{said}");
     let said = train(&place, &["--out", "no", "--set", "data.poses=run/eval.json"]).refused();
     assert!(said.contains("`run/eval.json`: no poses file"), "{said}");
     let said = train(&place, &["--out", "no", "--set", "data.poses=none.json"]).refused();

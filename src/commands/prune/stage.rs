@@ -49,9 +49,11 @@ impl Stage {
         // What training kept out is split here, by the same rule.
         train_config.data.holdout = Holdout::None;
         let dataset = load_scene(scene, &train_config, console)?;
-        let cache = |views: &[View]| Arc::new(ImageCache::new(views.to_vec(), config.data.cache_bytes));
         // Who would judge tells whether these are renders of the model, which its own settings do not say.
-        let judges = cache(&split(&dataset, config.guard.views, Provenance::OwnRenders)?.guard);
+        let judging = split(&dataset, config.guard.views, Provenance::OwnRenders)?.guard;
+        let judges = Arc::new(ImageCache::new(judging, config.data.cache_bytes));
+        // All photographs share one budget.
+        let cache = |views: &[View]| Arc::new(judges.beside(views.to_vec()));
         let quality = {
             let splats = Splats::from_cloud(&model.cloud, device)?;
             gazesplat_train::evaluate(&splats, &judges, &train_config.render_options(), &mut |_, _| {})?

@@ -102,8 +102,8 @@ impl Strategy for Adc {
 
     fn watches(&self, step: u32) -> Option<Watched> {
         let watched = if self.section.absolute_gradients { Watched::Absolute } else { Watched::Signed };
-        // After the last refinement nobody reads the statistic.
-        (step <= self.timing.stop).then_some(watched)
+        // After the last refinement nobody reads the statistic, and a sweep may take rows from under it.
+        self.timing.last().is_some_and(|last| step <= last).then_some(watched)
     }
 
     fn observe(&mut self, seen: Observation) {

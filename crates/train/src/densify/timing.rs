@@ -34,6 +34,12 @@ impl Timing {
         }
     }
 
+    /// The last of them, if there is one.
+    pub fn last(&self) -> Option<u32> {
+        let span = self.stop.checked_sub(self.start)?;
+        Some(self.stop - span.checked_rem(self.every)?)
+    }
+
     /// Whether step `step`, counted from 1, is one.
     pub fn is_due(&self, step: u32) -> bool {
         step >= self.start && step <= self.stop && (step - self.start).is_multiple_of(self.every)
@@ -57,5 +63,9 @@ mod tests {
         assert_eq!(of(StrategyKind::Adc, 300), (15, 150, 5));
         let section = DensifySection { stop: Some(0.25), strategy: StrategyKind::Adc, ..DensifySection::default() };
         assert_eq!(Timing::new(&section, 30_000).stop, 7500);
+        for (start, stop, every) in [(38, 389, 7), (500, 15_000, 100), (5, 5, 3), (6, 5, 3)] {
+            let timing = Timing { start, stop, every };
+            assert_eq!(timing.last(), (1..=stop).rev().find(|&step| timing.is_due(step)), "{timing:?}");
+        }
     }
 }

@@ -111,6 +111,8 @@ pub struct ModelState {
     lag: Option<ShRates>,
     /// Whether rows lag: the state then has their words.
     is_lagging: bool,
+    /// Updates done when the words were made: none of them is smaller.
+    words_since: u32,
     /// Whether what the next update will see has been brought up to date.
     is_prepared: bool,
 }
@@ -138,6 +140,7 @@ impl ModelState {
             device: device.clone(),
             lag: None,
             is_lagging: false,
+            words_since: 0,
             is_prepared: false,
         })
     }
@@ -156,6 +159,7 @@ impl ModelState {
             device: device.clone(),
             lag: None,
             is_lagging,
+            words_since: 0,
             is_prepared: false,
         })
     }
@@ -224,6 +228,11 @@ impl ModelState {
     /// Opens a state again that a loss closed, at the number of updates it has really seen.
     pub(crate) fn reopen(&mut self, num_updates: u32) {
         self.num_updates = num_updates;
+        if self.is_lagging && self.words_since > num_updates {
+            // Made while the state was closed: they speak of updates that were never done.
+            self.tensors_mut().last = placeholder(&self.device);
+            (self.is_lagging, self.is_prepared) = (false, false);
+        }
         let status = status_tensor(Status::default(), &self.device);
         if let Some(tensors) = &mut self.tensors {
             tensors.status = status;
@@ -360,7 +369,7 @@ impl ModelState {
         tensors.status = status_tensor(Status::default(), &self.device);
         self.tensors = Some(tensors);
         self.num_updates = snapshot.num_updates;
-        (self.is_lagging, self.is_prepared) = (snapshot.is_lagging, false);
+        (self.is_lagging, self.is_prepared, self.words_since) = (snapshot.is_lagging, false, 0);
         *self.is_handed_out.get_mut() = false;
         Ok(())
     }

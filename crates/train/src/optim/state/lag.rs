@@ -86,7 +86,7 @@ impl ModelState {
         if !self.is_lagging {
             let words = vec![self.num_updates; self.num_rows()];
             self.tensors_mut().last = words_tensor(words, &self.device);
-            self.is_lagging = true;
+            (self.is_lagging, self.words_since) = (true, self.num_updates);
         }
         let missed = self.missed_updates();
         self.apply(|state, shared| <Dispatch as OptimOps>::prepare_seen(state, view, missed, shared))?;

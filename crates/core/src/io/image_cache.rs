@@ -123,6 +123,18 @@ impl ImageCache {
     /// # Errors
     /// [`Error::Parameter`] when there is no such view; else as [`load_view_image`]. Errors are not remembered.
     pub fn get(&self, index: usize) -> Result<Arc<TrainingImage>> {
+        self.fetch(index, true)
+    }
+
+    /// The image of view `index`, not kept if it is not held.
+    ///
+    /// # Errors
+    /// As [`ImageCache::get`].
+    pub(super) fn get_unkept(&self, index: usize) -> Result<Arc<TrainingImage>> {
+        self.fetch(index, false)
+    }
+
+    fn fetch(&self, index: usize, keep: bool) -> Result<Arc<TrainingImage>> {
         let Some(view) = self.views.get(index) else {
             return Err(Error::parameter("view index", format!("{index}, expected less than {}", self.views.len())));
         };
@@ -135,25 +147,8 @@ impl ImageCache {
         let mut state = self.pool.lock();
         state.num_reserved -= expected;
         state.num_misses += 1;
-        Ok(state.insert(self.first + index, Arc::new(loaded?), self.pool.byte_budget))
-    }
-
-    /// The image of view `index`, not kept if it is not held.
-    ///
-    /// # Errors
-    /// As [`ImageCache::get`].
-    pub(super) fn get_unkept(&self, index: usize) -> Result<Arc<TrainingImage>> {
-        let Some(view) = self.views.get(index) else { return self.get(index) };
-        if let Some(image) = self.pool.lock().hit(self.first + index) {
-            return Ok(image);
-        }
-        let expected = opaque_bytes(view);
-        self.pool.lock().reserve(expected, self.pool.byte_budget);
-        let loaded = load_view_image(view);
-        let mut state = self.pool.lock();
-        state.num_reserved -= expected;
-        state.num_misses += 1;
-        loaded.map(Arc::new)
+        let image = Arc::new(loaded?);
+        Ok(if keep { state.insert(self.first + index, image, self.pool.byte_budget) } else { image })
     }
 
     /// Makes room for `num_bytes` that are held elsewhere, and says whether the budget has as many.
